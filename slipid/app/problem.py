@@ -89,7 +89,8 @@ def _wheel_weights(
 
 
 FREE_LENGTH = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
-"""Parameter that is fitted, by the kind of lengths that are trusted (`fit.lengths_from`)."""
+"""Length that is fitted because the others are trusted, keyed by the config's `fit.lengths_from`:
+with "poses" the poses' scale is trusted, with "wheels" the wheel radius."""
 SIZE_STD = 0.1
 """Std of that parameter's prior relative to its nominal value [1]: tyres deform, and cameras are
 set up by eye."""

@@ -15,8 +15,8 @@ from slipid.camera.opencv import Grey, cv2
 from slipid.support.errors import DataError, bad_data
 
 LOST_SHARE = 0.02
-"""Share of the announced frames that a file may lack, since some formats only estimate their
-number [1]."""
+"""Largest fraction of a file's announced frames that may be missing without a note [1]; some
+formats only estimate their number."""
 UNEVEN_RATE = 0.2
 """Largest relative difference of an interval between frames from the median interval for which the
 frame rate still counts as even [1]."""

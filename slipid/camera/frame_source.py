@@ -153,7 +153,7 @@ class Device(FrameSource):
         with closing(Capture(place)) as capture:
             first = capture.next_picture()
         if first is None:
-            raise DataError(f"{name}: it shows nothing; expected a camera that is not in use")
+            raise DataError(f"{name}: no frame; expected a camera that no other program uses")
         return cls(name, size_of(first), None, False, f"{place} {time.time_ns()}", place, seconds)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
@@ -241,9 +241,9 @@ def open_source(
     path = Path(place)
     if place.isdigit() or place.startswith("/dev/video"):
         if seconds is None or not 0 < seconds < float("inf"):
-            raise DataError(f"device {place}: it has no end; expected --seconds")
+            raise DataError(f"device {place}: expected --seconds, the length of the recording")
         if fps is not None or times is not None:
-            raise DataError(f"device {place}: its times are this computer's; no --fps, no --times")
+            raise DataError(f"device {place}: times are this computer's; omit --fps and --times")
         return Device.at(place, seconds)
     if seconds is not None:
         raise DataError(f"--seconds is for devices, not for {place}; a video is read to its end")
@@ -266,7 +266,7 @@ def open_source(
 def still(path: Path) -> np.ndarray:
     """Return a picture, or the median of a video's frames, as rows, columns and blue, green, red.
 
-    An object that moves through a video does not appear in the median, unless it stands in one
+    An object that moves through a video does not appear in the median, unless it stays in one
     place for half of the time.
 
     Raises:
@@ -283,7 +283,7 @@ def still(path: Path) -> np.ndarray:
             if picture is None:
                 break
             kept += [picture] if chosen else []
-            if len(kept) == 2 * MEDIAN_FRAMES:  # only if the file states no length
+            if len(kept) == 2 * MEDIAN_FRAMES:  # length unknown or wrong: keep every second frame
                 kept, every = kept[::2], 2 * every
     if not kept:
         raise DataError(f"{path}: no frame that OpenCV can decode; expected a picture or a video")

@@ -15,8 +15,8 @@ from slipid.support.errors import DataError, did_you_mean
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Suffixes by which pictures are recognised; a picture of a board may have any."""
 NEARLY_MOST = 0.8
-"""Share of the largest number of detected markers from which on a smaller dictionary is preferred
-[1]."""
+"""Fraction of the largest number of markers detected with any dictionary [1]; the smallest
+dictionary that reaches it is chosen."""
 Mask = Bool[np.ndarray, "row column"]
 """Boolean mask over the pixels of a picture or the cells of a grid."""
 Labels = Int[np.ndarray, "row column"]
@@ -87,9 +87,9 @@ def marker_count(dictionary: str) -> int:
 
 
 def visible_markers(pictures: Sequence[np.ndarray]) -> tuple[str, list[int]]:
-    """Return the dictionary of the markers in pictures, whatever it is, and the markers' numbers.
+    """Find the dictionary of the markers in pictures; return its name and the markers' numbers.
 
-    Of the dictionaries with nearly the most detected markers, the smallest one is chosen.
+    It is the smallest dictionary with at least `NEARLY_MOST` of the most detected markers.
     """
     numbers: dict[str, set[int]] = {}
     for name in dictionary_names():

@@ -196,7 +196,7 @@ class CameraFile(Section):
         if not (fx > 0 and fy > 0 and last == [0, 0, 1]):
             raise ValueError(f"matrix {self.matrix}; expected [[f, 0, x], [0, f, y], [0, 0, 1]]")
         if (count := len(self.distortion)) not in (0, 4, 5, 8, 12, 14):
-            raise ValueError(f"{count} numbers of distortion; expected 4, 5, 8, 12 or 14")
+            raise ValueError(f"{count} distortion coefficients; expected 4, 5, 8, 12 or 14")
         if self.rotation_from_world is None or self.place_m is None:
             return self
         rotation, height = np.array(self.rotation_from_world), self.place_m[2]

@@ -28,8 +28,8 @@ class ControllerRow:
             current, wheel by wheel) or `contact` (`slipid.Estimator`).
         about: description for people.
         correction: torque correction of the 2021 paper.
-        law: function that makes, for a robot, a published law that replaces the pose loop; None
-            for the pose loop.
+        law: function that returns, for a robot, the published control law that replaces the pose
+            loop; None for the pose loop.
         tuned: True if it uses the tuned gains of robot.json when they are better than those set by
             hand.
         gyro: True if the robot has a gyro.

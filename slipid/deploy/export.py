@@ -141,7 +141,7 @@ def _checked_row(options: ExportOptions, rows: Mapping[str, ControllerRow]) -> C
         raise DataError(f"controller {controller} needs a map of the floors; give one with --map")
     if options.map is not None and not row.mapped:
         raise DataError(
-            f"controller {controller} does not use a map; leave out --map, or use contact_map"
+            f"controller {controller} uses no map; omit --map, or use --controller contact_map"
         )
     return row
 

@@ -52,7 +52,7 @@ def robot_record(
 
     Args:
         robot: robot with every number at its value in `numbers`.
-        numbers: numbers by path; those of the camera are left out.
+        numbers: parameters keyed by path; those of the camera are not recorded.
         std: std of every variance component by name (such as `process.gray.along`), as used in
             forecasts of new runs.
         draws: posterior draws of the robot, stacked, from which the uncertainty of the motion is
@@ -88,7 +88,7 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
-    """Return the record of a floor's errors, from the stds of variance components by name."""
+    """Return the record of a floor's errors, from the stds of variance components keyed by name."""
     shared = sum(on_floor(std, kind, name) ** 2 for kind in SHARED)
     effect = np.sqrt(on_floor(std, "run", name, (0.01, 0.01, 0.03)) ** 2 + shared)
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
@@ -109,7 +109,7 @@ def _load(
     frame, twists = shape.frame(), directions(36)
     if not shape.determines_twist:
         twists = np.concatenate([twists, _turns(frame)])
-    speed, amps, slip = _circle(robot, k, top, twists)
+    speed, amps, slip = _operating_points(robot, k, top, twists)
     curve = _wheel_curve(speed, amps, slip)
     return record.LoadRecord(
         name=name,
@@ -131,10 +131,10 @@ def _turns(frame: WheelFrame) -> Float[np.ndarray, "twist 3"]:
     return np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / np.asarray(frame.base)
 
 
-def _circle(
+def _operating_points(
     robot: Robot, load: int, top: float, twists: Float[np.ndarray, "twist 3"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return wheel speeds [rad/s], currents [A] and slip ratios [1] for some twists.
+    """Return wheel speeds [rad/s], currents [A] and slip ratios [1] at some twists on every floor.
 
     Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has the
     shape (floor and twist, drive).
@@ -159,8 +159,8 @@ def _wheel_curve(
     """Return a and b of the slip ratio a + b |I| of each drive, fitted over all floors [1, 1/A].
 
     It is the form that the 2021 paper's robot used, refitted here to the contact model. The slip
-    speed, wheel speed times slip ratio, is fitted by least squares, so that wheels that hardly turn
-    have little weight.
+    speed, wheel speed times slip ratio, is fitted by least squares, so that slow wheels have little
+    weight.
     """
     a = np.stack([speed, speed * np.abs(amps)], axis=-1)
     normal = np.einsum("nda,ndb->dab", a, a)
@@ -227,7 +227,7 @@ def _equilibria(
 
 
 DIRECTIONS = 72
-"""Number of directions in the effect table; they are half a length of the effects' kernel apart."""
+"""Number of directions in the effect table: half the width of the effects' kernel apart."""
 _Grid = Float[np.ndarray, "floor speed direction 3"]
 
 

@@ -99,7 +99,7 @@ LIMITS: Mapping[str, tuple[str, str]] = {
 
 
 def gains_origin(robot: DeployedRobot) -> str:
-    """Return sentences about the source of a robot's gains, and about its limits."""
+    """Return sentences about the origin of a robot's gains and limits, which are not identified."""
     limits = (
         "The limits are defaults of slipid and not identified: enter those of your motors and "
         "supply."

@@ -44,7 +44,7 @@ class Field:
 
     @property
     def size(self) -> int:
-        """Count of its numbers."""
+        """Number of elements."""
         return prod(self.shape)
 
 

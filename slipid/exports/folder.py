@@ -52,8 +52,8 @@ def check_writable(folder: Path) -> None:
         raise DataError(f"{folder}: not a folder; expected another path (--out)")
     sums = _sums(folder) if (folder / SUMS).is_file() else {}
     for name in sorted(_files(folder) - {SUMS}):
-        if _whole(name) in {SUMS, *sums}:
-            continue  # an unfinished file of an export that was killed
+        if _name_of_temporary(name) in {SUMS, *sums}:
+            continue  # a temporary file of an interrupted export may be overwritten
         if name not in sums:
             raise DataError(
                 f"{folder}: contains files that are not from an export ({name}); expected another "
@@ -86,14 +86,14 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
             )
     if more := sorted(_files(place) - set(sums) - {SUMS}):
         raise DataError(
-            f"{place / more[0]}: added after the folder was written; move it elsewhere, or export "
-            "the robot again"
+            f"{place / more[0]}: added after the folder was written; move it elsewhere, or "
+            "export the robot again"
         )
     return tuple(sums)
 
 
 def _sums(folder: Path) -> dict[str, str]:
-    """Return the checksums in the folder's checksum file, by file name."""
+    """Return the checksums in the folder's checksum file, keyed by file name."""
     try:
         text = (folder / SUMS).read_text()
     except (OSError, UnicodeDecodeError):
@@ -107,8 +107,8 @@ def _sums(folder: Path) -> dict[str, str]:
     return named
 
 
-def _whole(name: str) -> str | None:
-    """Return the final name of an unfinished file of `write_bytes`; None for other files."""
+def _name_of_temporary(name: str) -> str | None:
+    """Return the name that a temporary file of `write_bytes` would get; None for other files."""
     match = re.fullmatch(r"((?:.*/)?)\.(.+)\.[0-9a-f]{8}", name)
     return None if match is None else match[1] + match[2]
 

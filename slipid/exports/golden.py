@@ -23,9 +23,9 @@ class Golden:
     """Successive steps of a robot that starts at rest at the pose 0, 0, 0, one row each.
 
     Attributes:
-        given: inputs: the arrays of the reading, the reference, and dt [s], one after the other.
-        said: outputs of the estimator: the arrays of the estimate, one after the other.
-        command: wheel speeds [rad/s].
+        given: inputs: all arrays of the reading, the reference, and dt [s], concatenated.
+        said: outputs of the estimator: all arrays of the estimate, concatenated.
+        command: outputs of the controller: wheel speeds [rad/s].
     """
 
     given: Float[np.ndarray, "step input"]
@@ -34,7 +34,7 @@ class Golden:
 
 
 def golden(loop: ControlLoop[eqx.Module]) -> Golden:
-    """Return steps in which every sensor has readings at some time and none at another."""
+    """Return steps in which every sensor has readings at some times and none at others."""
     run = jax.jit(lambda *inputs: loop_step(loop, *inputs))
     begin = loop.init()
     state, rows = (begin.estimator, begin.controller), []

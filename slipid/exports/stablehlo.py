@@ -42,8 +42,8 @@ class Signature:
 
     Attributes:
         state: arrays of the state, which are the first inputs and the first outputs.
-        given: further inputs.
-        said: further outputs.
+        given: all other inputs: readings, reference and dt.
+        said: all other outputs: estimate and command.
     """
 
     state: tuple[Field, ...]
@@ -69,7 +69,7 @@ class Program:
 
 
 def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
-    """Return the content of the folder's files by name.
+    """Return the content of the folder's files, keyed by name.
 
     They are the step of one robot, the step of many robots, a description and reference steps.
     """
@@ -148,12 +148,12 @@ def load_program(folder: Path | str) -> Program:
     except Exception as error:  # The parsers of three formats raise many kinds of errors.
         raise DataError(f"{place}: damaged ({error}); export the robot again") from error
     program = Program(signature, tuple(start), *programs)
-    _repeated(program, steps, place)
+    _check_results(program, steps, place)
     return program
 
 
-def _repeated(program: Program, steps: Golden, place: Path) -> None:
-    """Raise `DataError` if the program's results for one robot or for two at once differ."""
+def _check_results(program: Program, steps: Golden, place: Path) -> None:
+    """Raise `DataError` unless the program reproduces the reference steps, also in a batch."""
     one, two = list(program.start), [jnp.stack([x, x]) for x in program.start]
     count = len(one)
     scale = np.maximum(np.abs(steps.said).max(axis=0), 1e-3)
@@ -167,8 +167,8 @@ def _repeated(program: Program, steps: Golden, place: Path) -> None:
             gap = np.abs(numbers - np.concatenate([estimate, command]))
             if not (gap <= TOLERANCE * np.concatenate([scale, np.ones(len(command))])).all():
                 raise DataError(
-                    f"{place}: the program does not reproduce the results computed at export "
-                    f"(difference {gap.max():.1e}); export the robot again"
+                    f"{place}: results of the program differ from those of the export by up to "
+                    f"{gap.max():.1e}; export the robot again"
                 )
 
 

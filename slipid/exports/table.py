@@ -101,7 +101,9 @@ def _curve(robot: DeployedRobot) -> Iterator[NumberRow]:
 def _csv(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
     text = io.StringIO()
     for line in header(robot):
-        text.write(f"# {line}".replace('"', "'") + "\n")  # CSV readers join lines at quotes
+        text.write(
+            f"# {line}".replace('"', "'") + "\n"
+        )  # a double quote would make readers join lines
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(HEAD)
     for x in lines:

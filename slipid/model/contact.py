@@ -72,8 +72,7 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
     damping = jnp.asarray(_DAMPING)
     tried = jax.vmap(merit)(damping)
     best = jnp.argmin(tried)
-    # If all wheels slide, forces hardly depend on the twist, and Newton's step would be far too
-    # long.
+    # where all wheels slide, forces depend little on the twist and Newton's step leads far away
     stuck = (tried[best] >= before) & (before > _ROUNDING)
     return jax.tree.map(partial(jnp.where, stuck), balance.chord(xi), less(damping[best]))
 

@@ -48,13 +48,13 @@ from slipid.model.se2 import Planar
 from slipid.parameter import parameter
 
 _LIFTED = 0.03
-"""Load over the mean wheel load below which drag is in proportion to the load (p has no effect)."""
+"""Ratio of load to mean wheel load below which drag is proportional to load: p has no effect."""
 V0 = 0.002
 """Sliding speed below which traction is viscous [m/s]."""
 VR = 0.001
 """Roller speed below which roller drag is viscous [m/s]."""
 S1 = 0.2
-"""Speed along the drive, over wheel activity, below which rolling resistance is viscous."""
+"""Ratio of speed along the drive to wheel activity below which rolling resistance is viscous."""
 W0 = 0.05
 """Yaw rate below which the scrub moment is viscous [rad/s]."""
 
@@ -62,7 +62,7 @@ W0 = 0.05
 _STILL = 1e-6
 """Sliding speed added in quadrature, so that its magnitude is smooth at standstill [m/s]."""
 positive = partial(parameter, lower=0.0)
-"""Declaration of a number above zero."""
+"""Declaration of a parameter above zero."""
 
 
 class ContactSurface(eqx.Module):
@@ -189,7 +189,7 @@ class Friction(eqx.Module):
         return jnp.tanh(self._size() / self.onset) / self._size()
 
     def _bent(self) -> Array:
-        """Return the derivative of `_slope` by m, over m."""
+        """Return the derivative of `_slope` by m, divided by m."""
         m = self._size()
         steep = (1 - jnp.tanh(m / self.onset) ** 2) / self.onset
         return (steep - self._slope()) / m**2

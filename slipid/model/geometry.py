@@ -242,8 +242,8 @@ def _wheel_frame(
         c, s = jnp.cos(angle), jnp.sin(angle)
         return jnp.stack([c, s, p[:, 0] * s - p[:, 1] * c], axis=-1)
 
-    # Loads change with the contact patches, with the smallest possible change: N = N0 - shift @
-    # displacement
+    # `shift`: minimum-norm change of the loads that keeps their sum and centre when the contact
+    # patches are displaced, N = N0 - shift @ displacement
     lever = jnp.concatenate([jnp.ones((1, len(p))), p.T], axis=0)
     return WheelFrame(
         hold=row(hold),

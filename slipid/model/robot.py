@@ -46,7 +46,7 @@ class Body(eqx.Module):
 
 
 class Robot(eqx.Module):
-    """All known or fitted numbers of a robot; `entries(robot)` names each of them.
+    """All known or fitted parameters of a robot; `entries(robot)` names each of them.
 
     Attributes:
         surfaces: floors, stacked in the order of `surfaces.labels`.
@@ -132,7 +132,7 @@ class Standing(eqx.Module):
     Attributes:
         frame: directions and radii of the wheels.
         floor: the floor, or the floor under each wheel.
-        rest: share of the load on each wheel at rest.
+        rest: fraction of the weight on each wheel at rest [1].
         motor: motor, which all drives share.
         mass: mass of the robot [kg].
     """
@@ -191,7 +191,7 @@ class Standing(eqx.Module):
 
 @dataclass(frozen=True)
 class Validity:
-    """Range of conditions of the runs on a floor; outside it the fitted numbers are extrapolated.
+    """Range of conditions in which a floor was driven; outside it, predictions extrapolate.
 
     Attributes:
         runs: number of runs.

@@ -1,1 +1,1 @@
-"""Pictures of results, with one module per subject."""
+"""Figures of results, with one module per subject."""

@@ -1,4 +1,4 @@
-"""Picture of a fit to bench logs of a motor: measured and fitted signals, and residuals."""
+"""Figure of a fit to bench logs of a motor: measured and fitted signals, and residuals."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ MAX_POINTS = 4000
 
 
 def bench_plots(fit: BenchFit, out: Path) -> list[Path]:
-    """Write a picture of every motor, bench.png or bench_LABEL.png; return the files."""
+    """Write a figure of every motor, bench.png or bench_LABEL.png; return the files."""
     return [
         save(bench_figure(f), out / (f"bench_{f.label}.png" if f.label else "bench.png"))
         for f in fit.fits
@@ -38,8 +38,8 @@ def bench_figure(fit: MotorFit) -> Figure:
     return made
 
 
-def _clock(w: BenchWindows) -> np.ndarray:
-    """Return the time of windows, where each record begins at the end of the previous one [s]."""
+def _times(w: BenchWindows) -> np.ndarray:
+    """Return the times of windows, with records placed one after the other on a time axis [s]."""
     ends = [float(w.time[w.record == k].max(initial=0.0)) for k in range(int(w.record.max()) + 1)]
     return np.asarray(w.time + np.concatenate([[0.0], np.cumsum(ends)])[w.record])
 
@@ -47,7 +47,7 @@ def _clock(w: BenchWindows) -> np.ndarray:
 def _signals(axes: Axes, equation: Equation) -> None:
     plain(axes)
     w = equation.windows
-    clock, measured = _clock(w), w.measured.mean(axis=0)
+    clock, measured = _times(w), w.measured.mean(axis=0)
     fitted = np.where(w.usable, measured - equation.residual.mean(axis=0), np.nan)
     some = slice(None, None, max(1, len(clock) // MAX_POINTS))
     axes.plot(clock[some], measured[some], color=SHADE, lw=2.2, alpha=0.6, label="measured")
@@ -65,7 +65,7 @@ def _residuals(panels: list[Axes], equation: Equation) -> None:
     some = used[:: max(1, len(used) // MAX_POINTS)]
     for axes, (x, label) in zip(
         panels,
-        ((_clock(w), "time [s]"), (speed, "speed [rad/s]"), (current, "current [A]")),
+        ((_times(w), "time [s]"), (speed, "speed [rad/s]"), (current, "current [A]")),
         strict=True,
     ):
         plain(axes)

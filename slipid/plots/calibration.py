@@ -14,7 +14,8 @@ from slipid.camera.overhead import OverheadCamera
 from slipid.plots.drawing import BLUE, GREEN, INK, ORANGE, figure, save
 
 ARROW_LENGTH = 0.06
-"""Largest length at which the 95 % quantile of residuals is drawn, as a share of picture width."""
+"""Largest length at which the 95 % quantile of residuals is drawn, as a fraction of picture
+width."""
 GRID_STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
 """Possible distances between grid lines drawn on the floor [m]."""
 

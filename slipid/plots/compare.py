@@ -1,4 +1,4 @@
-"""Pictures that compare slip models: their errors, and the best model on every floor."""
+"""Figures that compare slip models: their errors, and the best model on every floor."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,7 +37,7 @@ MODEL_NAMES = {
 
 
 def compare_plot(found: Content, out: Path) -> Path:
-    """Write a picture of the ranking under the first kind of held-out runs in comparison.json."""
+    """Write a figure of the ranking under the first kind of held-out runs in comparison.json."""
     question, answer = next(iter(found["questions"].items()))
     made = compare_figure(answer["floors"], SHOWN.get(question, question))
     return drawing.save(made, out / "comparison.png")

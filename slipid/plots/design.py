@@ -1,4 +1,4 @@
-"""Picture of a proposal of runs: their commands, and the uncertainty over the number of runs."""
+"""Figure of a design: commands of the proposed runs, and uncertainty over the number of runs."""
 
 import math
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Functions and colours shared by all pictures; figures need no display."""
+"""Functions and colours shared by all figures; figures need no display."""
 
 import io
 import math

@@ -1,4 +1,4 @@
-"""Pictures of logs before a fit, and of the results of a fit and of a validation."""
+"""Figures of logs before a fit, and of the results of a fit and of a validation."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from slipid.predict.validation import Validation
 
 
 def raw_plots(data: Runs, out: Path) -> list[Path]:
-    """Write a picture of the logged signals for each floor and load set-up; return the files."""
+    """Write a figure of the logged signals for each floor and load set-up; return the files."""
     return [
         save(plot_runs(data, runs, f"{floor}, {load}"), out / f"raw_{floor}_{load}.png")
         for (floor, load), runs in sorted(runs_by_setup(data).items())
@@ -33,7 +33,7 @@ def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as lo
     Args:
         data: all runs.
         runs: indices of the runs that are drawn; None for all.
-        title: beginning of the picture's title.
+        title: beginning of the figure's title.
     """
     runs = range(len(data)) if runs is None else runs
     wheels = data.wheel_angle.shape[1]
@@ -61,10 +61,10 @@ def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as lo
 
 
 def load_figure(fit: Fit) -> Figure | None:
-    """Draw the share of the weight on each wheel, one panel per load set-up.
+    """Draw the fraction of the weight on each wheel, one panel per load set-up.
 
     Returns:
-        None if the shares of all load set-ups are fixed.
+        None if the load shares of all load set-ups are fixed.
     """
     loads = fit.robot.body.loads
     found = [fit.parameters[f"robot.load_share@{load}"] for load in loads]
@@ -80,7 +80,7 @@ def load_figure(fit: Fit) -> Figure | None:
 
 
 def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
-    """Draw the robot from above with its shares of the weight; x is up and y to the left."""
+    """Draw the robot from above with the load share of each wheel; x is up and y to the left."""
     shape = fit.robot.geometry
     base, radius = float(shape.base_radius), float(shape.wheel_radius)
     place = np.asarray(shape.place) * base
@@ -128,7 +128,7 @@ def _words(k: int, estimate: Estimate) -> str:
 PATHS = "Paths by the encoders (dotted), by the fitted robot (blue)\nand by the camera (gray): "
 
 
-PICTURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
+FIGURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
     "slip_by_heading": lambda fit, data, measured: heading_figure(fit.robot, measured),
     "paths": lambda fit, data, measured: path_figure(
         fit.contact, data, measured.groups, PATHS + "runs of the fit"
@@ -137,16 +137,16 @@ PICTURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
     "current_by_traction": lambda fit, data, measured: current_figure(measured),
     "load_share": lambda fit, data, measured: load_figure(fit),
 }
-"""Functions that draw the pictures of a fit, by name; they return None if data are missing."""
+"""Functions that draw the figures of a fit, by name; they return None if data are missing."""
 
 
 def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) -> list[Path]:
-    """Write all `PICTURES` for which the runs of the fit have data; return the files.
+    """Write all `FIGURES` that the runs of the fit have data for; return the files.
 
-    If the fit cannot be trusted, `warning` is added to the title of each picture.
+    If the fit cannot be trusted, `warning` is added to the title of each figure.
     """
     measured = measured_windows(fit.robot, data, fit.channels.windows)
-    made = {name: draw(fit, data, measured) for name, draw in PICTURES.items()}
+    made = {name: draw(fit, data, measured) for name, draw in FIGURES.items()}
     if warning is not None:
         for figure in filter(None, made.values()):
             add_warning(figure, warning)
@@ -154,21 +154,21 @@ def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) 
 
 
 def picture(fit: Fit, data: Runs, name: str) -> Figure:
-    """Return the picture with this name.
+    """Return the figure with this name.
 
     Raises:
-        ValueError: there is no such picture, or the runs lack the data for it.
+        ValueError: there is no such figure, or the runs lack the data for it.
     """
-    if name not in PICTURES:
-        raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
-    made = PICTURES[name](fit, data, measured_windows(fit.robot, data, fit.channels.windows))
+    if name not in FIGURES:
+        raise ValueError(f"no figure '{name}'; there are {', '.join(FIGURES)}")
+    made = FIGURES[name](fit, data, measured_windows(fit.robot, data, fit.channels.windows))
     if made is None:
-        raise ValueError(f"picture '{name}': the runs do not have the data for it")
+        raise ValueError(f"figure '{name}': the runs lack the data for it")
     return made
 
 
 def validate_plots(fit: Fit, data: Runs, found: Validation, out: Path) -> list[Path]:
-    """Write pictures of a validation's errors and of some predicted paths; return the files."""
+    """Write figures of a validation's errors and of some predicted paths; return the files."""
     names = {log.surface or "unknown": None for log in data.logs}
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {

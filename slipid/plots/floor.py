@@ -17,7 +17,7 @@ from slipid.data.geojson_map import Patch, VectorMap, covered
 from slipid.plots.drawing import INK, SHADE, figure, save
 
 LABELLED_SHARE = 0.01
-"""Smallest share of the area of the map for which a patch is labelled with its name."""
+"""Smallest fraction of the map's area at which a patch is labelled with its name."""
 HATCH = "////"
 
 

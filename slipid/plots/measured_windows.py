@@ -1,4 +1,4 @@
-"""Measured and predicted slip, currents and torques of segments of runs, for pictures."""
+"""Measured and predicted slip, currents and torques of segments of runs, as figures show them."""
 
 from dataclasses import dataclass
 
@@ -18,9 +18,9 @@ from slipid.predict.slip_model import body_twist
 STRAIGHT = 0.98
 """Smallest ratio of displacement to path length, by encoders, of a segment that is straight."""
 SHORTEST_PATH = 0.05
-"""The slip of a wheel is too noisy to use if its rim moves by less than this in a segment [m]."""
+"""Largest rim travel of a wheel in a segment at which its slip is too noisy to use [m]."""
 TURNING = 0.5
-"""A segment counts as a turn from this yaw per path length, by encoders, on [rad/m]."""
+"""Smallest yaw per path length, by encoders, at which a segment counts as a turn [rad/m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +41,10 @@ class MeasuredWindows:
         drift: angle of the camera's displacement from that of the encoders, left positive [deg].
         yaw: yaw by camera less yaw by encoders, divided by the encoders' displacement [deg/m].
         wheel_speed: speed of the wheel [rad/s].
-        wheel_slip: 1 - (speed over the floor) / (rim speed) [1]; NaN for a wheel that hardly
-            turned.
+        wheel_slip: 1 - (speed over the floor) / (rim speed) [1]; NaN up to a rim travel of
+            `SHORTEST_PATH`.
         sideways: ratio of the wheel's sideways rolling speed to its rim speed [1].
-        share: share of the weight on the wheel in motion [1].
+        share: fraction of the weight on the wheel in motion [1].
         amps: measured current [A]; None if currents were not logged.
         amps_model: predicted current [A].
         torque: predicted traction torque at the wheel [N m].

@@ -1,4 +1,4 @@
-"""Pictures of motion: slip and drift over heading, and predicted and measured paths."""
+"""Figures of motion: slip and drift over heading, and predicted and measured paths."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -121,7 +121,7 @@ def path_figure(
         model: force balance that predicts, with shared effects as in the table of errors.
         data: the runs.
         order: (floor, load set-up) of the panels in order.
-        title: title of the picture, which names the set of runs.
+        title: title of the figure, which names the set of runs.
     """
     groups = runs_by_setup(data)
     names = [name for name in order if name in groups]

@@ -1,4 +1,4 @@
-"""Pictures of uncertainty: posterior draws and profile likelihoods beside Gaussian approximations.
+"""Figures of uncertainty: posterior draws and profile likelihoods beside Gaussian approximations.
 
 The Gaussian approximation of the posterior has the curvature of the loss at the fit.
 """
@@ -19,8 +19,8 @@ MOST_PANELS = 6
 
 
 def posterior_plots(found: Posterior, out: Path) -> list[Path]:
-    """Write all `PICTURES` of a posterior; return the files."""
-    return drawing.save_all({f"posterior_{k}": draw(found) for k, draw in PICTURES.items()}, out)
+    """Write all `FIGURES` of a posterior; return the files."""
+    return drawing.save_all({f"posterior_{k}": draw(found) for k, draw in FIGURES.items()}, out)
 
 
 def interval_figure(found: Posterior) -> Figure:
@@ -77,8 +77,8 @@ def pair_figure(found: Posterior) -> Figure:
     return made
 
 
-PICTURES = {"intervals": interval_figure, "pairs": pair_figure}
-"""Functions that draw the pictures of a posterior, by name."""
+FIGURES = {"intervals": interval_figure, "pairs": pair_figure}
+"""Functions that draw the figures of a posterior, keyed by name."""
 
 
 def curved_pairs(z: np.ndarray) -> list[tuple[int, int]]:

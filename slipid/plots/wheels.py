@@ -1,4 +1,4 @@
-"""Pictures of single wheels: slip over torque, and motor current over predicted traction."""
+"""Figures of single wheels: slip over torque, and motor current over predicted traction."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,10 +17,10 @@ from slipid.plots.motion import named
 SIDEWAYS_COLOUR = "#35B779"
 """Colour of the curve of a wheel whose sideways speed equals its rim speed, and of such dots."""
 AT_REST = 0.05
-"""A wheel counts as at rest up to this ratio of its speed to that of the fastest wheel."""
+"""Largest ratio of a wheel's speed to that of the fastest wheel at which it counts as at rest."""
 TOO_SLOW = 0.3
-"""The slip of a wheel is too uncertain to be drawn up to this ratio of its speed to that of the
-fastest wheel."""
+"""Largest ratio of a wheel's speed to that of the fastest wheel at which its slip is too uncertain
+to be drawn."""
 
 
 def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
@@ -127,7 +127,7 @@ def wheel_curve(
         slip: slip of the wheel along its drive direction [1].
         sideways: ratio of the wheel's sideways speed to its rim speed [1].
         wheel_speed: speed of the wheel [rad/s].
-        share: share of the weight on the wheel.
+        share: fraction of the weight on the wheel.
 
     Source: `slipid.model.contact_law`.
     """
@@ -187,7 +187,7 @@ def _amps(
     ax: Axes, measured: MeasuredWindows, mine: np.ndarray, wheel: int, top: float
 ) -> PathCollection:
     assert measured.amps is not None
-    # Wheels at rest are left out: their gear holds them, which the motor model does not describe.
+    # omit wheels at rest: their gear holds them, which the motor model does not describe
     speed, fastest = measured.wheel_speed[:, wheel], np.abs(measured.wheel_speed).max(axis=1)
     mine = mine & (np.abs(speed) > AT_REST * fastest)
     speed = speed[mine]

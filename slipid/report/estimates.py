@@ -1,4 +1,4 @@
-"""Tables of parameters before and after a fit and beside the truth, and of prediction errors."""
+"""Tables of parameters before and after a fit, with true values, and of prediction errors."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -113,7 +113,7 @@ def _clocks(clocks: Mapping[str, Content]) -> str:
     offsets = [clock["offset_s"] for clock in clocks.values()]
     wide = [0.5 * (high - low) for low, high in (c["offset_interval90_s"] for c in clocks.values())]
     rate = max((clock["drift"] for clock in clocks.values()), key=abs)
-    question = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate correct?"
+    question = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate right?"
     by = ", ".join(sorted({clock["told_by"] for clock in clocks.values()}))
     return (
         f"clock of the poses, from the motion ({by}): {min(offsets):+.3f} to {max(offsets):+.3f} s "
@@ -228,7 +228,7 @@ def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
 
 
 def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
-    """Write estimates beside true values, and the number of intervals that contain them."""
+    """Write estimates next to true values, and how many intervals contain the truth."""
     rows = compared(fit, truth)
     columns = ("parameter", "truth", "identified", "unit", "90 % interval", "truth in it", "")
     made = table(columns, right=("truth", "identified"))

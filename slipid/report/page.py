@@ -91,5 +91,5 @@ def verdict(word: str, colour: dict[str, str] = COLOUR) -> str:
 
 
 def percent(x: float | None) -> str:
-    """Return a share as text in percent with two decimal places; empty for None."""
+    """Return a fraction as text in percent with two decimal places; empty for None."""
     return "" if x is None else f"{100 * x:.2f} %"

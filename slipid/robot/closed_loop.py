@@ -25,7 +25,7 @@ from slipid.robot.trajectory import Path
 PERIOD = 0.05
 """Time between two commands [s]."""
 DURATION_FACTOR = 2.0
-"""A run is stopped after this multiple of the duration of the path, plus 10 s [1]."""
+"""Multiple of the path's duration after which, with 10 s added, a run is stopped [1]."""
 
 
 class ControlLoopState(eqx.Module, Generic[State]):
@@ -133,7 +133,7 @@ class ClosedLoopRun:
 
 
 _step = eqx.filter_jit(ControlLoop.step)
-"""Compiled step with all numbers as arguments, so that loops of equal structure share it."""
+"""Compiled step with all numbers as arguments, so that loops of equal structure share the code."""
 
 
 def run_closed_loop(

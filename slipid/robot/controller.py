@@ -6,7 +6,7 @@ differ in the terms that they add to the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 
-or in a law that replaces it.
+or in a control law that replaces it.
 
 with the pose p [m] and heading [rad], their references p_ref and heading_ref, the demanded velocity
 v [m/s] in the body frame and yaw rate W [rad/s], and R, the rotation from world to body axes.
@@ -45,8 +45,8 @@ STUCK_S = 0.5
 """A robot counts as stuck after this time without the demanded motion, and as free again after this
 time with it [s]."""
 STUCK_SHARE, STUCK_LEAST_SPEED = 0.2, 0.1
-"""A robot counts as blocked if its speed is below this share of the demanded speed [1], provided
-that the demanded speed exceeds the second number [m/s]."""
+"""A robot counts as blocked if its speed is below `STUCK_SHARE` times the demanded speed [1], and
+the demanded speed exceeds `STUCK_LEAST_SPEED` [m/s]."""
 RECOVERY_TURN_S, RECOVERY_DRIVE_S = 0.6, 1.2
 """Durations of the alternating phases of a recovery: turning on the spot, then driving [s]."""
 RECOVERY_GROWTH = 0.6
@@ -73,8 +73,8 @@ class Gains(eqx.Module):
     def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
         """Return the gains tuned for a robot and its load set-up if they beat those set by hand.
 
-        With `forced`, the tuned gains are returned even if they are not better. Without tuned gains
-        for this load set-up, those set by hand are returned.
+        With `forced`, tuned gains are returned even if they are no better. In all other cases, and
+        without tuned gains for this load set-up, the gains set by hand are returned.
 
         Raises:
             ValueError: the robot has no record.
@@ -184,7 +184,7 @@ def _recovery_factors(tried: Float[Array, ""]) -> Float[Array, "3"]:
 
 
 class Controller(eqx.Module):
-    """Pose loop with optional correction terms, or another law that replaces it.
+    """Pose loop with optional correction terms, or another control law that replaces it.
 
     Attributes:
         robot: identified robot.
@@ -194,8 +194,8 @@ class Controller(eqx.Module):
         correction: torque correction of the 2021 paper: "paper_print" as printed in the paper,
             "paper_code" as in the authors' program, "torque" with their errors corrected, or
             "none".
-        law: law that replaces the pose loop and its integral; if it is an equinox module, its
-            numbers are arguments of the compiled code.
+        law: control law that replaces the pose loop and its integral; if it is an equinox module,
+            its numbers are arguments of the compiled code.
     """
 
     robot: RobotArrays

@@ -37,12 +37,12 @@ class RobotArrays(Drives):
         inverse: pseudo-inverse of J (3, drive).
         motor: constants of the motor, which all drives share.
         floors: contact parameters, one row per floor in the order of `labels`.
-        rest: share of the load on each wheel at rest.
+        rest: fraction of the weight on each wheel at rest [1].
         mass: mass of the robot [kg].
         process: std of the model's random errors, which grow with the root of the path length,
             along and across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
         effect: std of the effects, errors that stay the same over the path, along and across [m/m]
-            and in yaw [rad/m]; it includes the posterior spread of the fitted numbers.
+            and in yaw [rad/m]; it includes the posterior spread of the fitted parameters.
         effect_table: estimates of the effects from the fitted runs, by direction and speed.
         friction_covariance: posterior covariance of the log frictions.
         current_std: std of measured less modelled currents, without the ammeters' noise [A].
@@ -93,7 +93,7 @@ class RobotArrays(Drives):
         return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
 
     def standing(self, under: Int[Array, " wheel"]) -> Standing:
-        """Return the robot with the floors number `under` under its wheels."""
+        """Return the robot on given floors; `under` is the index of the floor under each wheel."""
         return Standing(self.frame, self.floors.at(under), self.rest, self.motor, self.mass)
 
     @property
@@ -213,8 +213,8 @@ def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedR
     """Return the robots of the posterior draws with indices `picked`, stacked along a leading axis.
 
     `DeployedRobot.effect` then holds only the differences between runs, since the draws themselves
-    show the spread of the numbers. The means of the effect tables, the remaining shares of their
-    std, `highest` and `wheel_curve` are those of `robot`.
+    show the spread of the parameters. The effect tables (mean, remaining fraction of the std),
+    `highest` and `wheel_curve` are those of `robot`.
     """
     record, one = robot.record, []
     plain = {path: n.value for path, n in record.parameters.items()}
@@ -227,9 +227,9 @@ def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedR
 def _arrays(
     record: RobotRecord, load: str | None, values: Mapping[str, Numbers], spread: bool = True
 ) -> DeployedRobot:
-    """Return the arrays of a record for `values` of its numbers by path.
+    """Return the arrays of a record, with `values` of its parameters, keyed by path.
 
-    With `spread` the std of effects includes the posterior uncertainty of the numbers.
+    With `spread` the std of effects includes the posterior uncertainty of the parameters.
     """
     place = record.load_index(load)
     chosen, wheels, floors = record.loads[place], record.wheels, record.floors
@@ -273,7 +273,7 @@ def _arrays(
 
 
 def _effect_table(load: LoadRecord, whole: Float[np.ndarray, "floor 3"]) -> EffectLookup:
-    """Return the effect table of a load set-up, its remaining stds as shares of `whole`.
+    """Return the effect table of a load set-up, with remaining stds divided by `whole`.
 
     `whole` (floor, 3) is the std of each floor's effects without a table [m/m, m/m, rad/m].
     """

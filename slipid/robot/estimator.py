@@ -141,7 +141,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
 
     def _slip(self, w: Array, twist: Array) -> Array:
-        """Return the slip ratio of each drive [1]; it is 0 while the drive stands still."""
+        """Return the slip ratio of each drive [1]; it is 0 while the drive is at rest."""
         f, turns = self.robot, jnp.abs(w) > 1e-3
         rim = f.frame.radius * jnp.where(turns, w, 1.0)
         return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
@@ -169,8 +169,7 @@ def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Arra
 
     Args:
         floors: belief before the correction.
-        left: share of the distances between the poses of hypotheses that remains after the
-            correction, in world axes (3, 3).
+        left: factor on the distances between the hypotheses' poses, in world axes (3, 3).
         place: corrected pose.
         expected: probability of each hypothesis by the map at the corrected pose.
     """

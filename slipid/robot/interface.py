@@ -53,7 +53,7 @@ class Settings(eqx.Module):
         gyro_std: noise of a gyro's reading [rad/s].
         gyro_bias_std: std of a gyro's bias at the start [rad/s].
         gyro_delay_s: age of a gyro's readings [s].
-        still_m_s: rim speed below which the robot counts as standing still [m/s].
+        still_m_s: rim speed below which the robot counts as at rest [m/s].
         stale_s: a wheel is stale after this time without readings [s].
         longest_s: longest time step for which motion is predicted [s].
     """
@@ -129,8 +129,8 @@ class Measurement(eqx.Module):
         gyro: yaw rate [rad/s].
         fix: pose from another source such as a camera: x, y [m], heading [rad].
         fix_std: std of the fix's position [m] and heading [rad]; a fix without it is ignored.
-        fix_age: age of the fix [s]; an unknown age counts as 0, and a fix older than 47 steps is
-            ignored.
+        fix_age: age of the fix [s]; an unknown age counts as 0, and a fix from before the 47 last
+            steps, of which the estimator keeps a history, is ignored.
     """
 
     wheel_angle: Given = None

@@ -147,7 +147,7 @@ class LoadRecord:
 
     Attributes:
         name: name of the load set-up.
-        spread: std of the motion per metre on every floor due to the uncertainty of the numbers.
+        spread: std of the motion per metre on every floor due to the parameters' uncertainty.
         told: effect table of this load set-up; None if the robot was not fitted to runs.
         highest_current: largest current that the model predicts up to 0.8 of the highest wheel
             speed.
@@ -195,7 +195,7 @@ class GainValues:
         place: gain of the position loop.
         yaw: gain of the heading loop.
         integral: gain of the integral of the position error.
-        ahead: feed-forward share of the contact model in the wheel speeds of earlier controllers.
+        ahead: fraction of the wheel speeds that earlier controllers took from the contact model.
         observer: gain of the disturbance observer.
         preview: time by which reference rates are taken ahead of the reference pose.
     """
@@ -229,7 +229,7 @@ class GainsRecord:
         gyro: True if the robot had a gyro.
         method: method of the search.
         loss: losses of the gains set by hand and of the tuned gains.
-        better_than_hand: share of the cases in which the tuned gains win.
+        better_than_hand: fraction of the cases in which the tuned gains win.
         stability_margin: 1 less the largest spectral radius of the linearized loops.
         verdict: comparison of the losses; "better" or "worse" if they differ by more than chance.
     """

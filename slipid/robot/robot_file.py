@@ -180,7 +180,7 @@ def _refused(word: str) -> None:
 def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     content = dict(pairs)
     if len(content) < len(pairs):
-        raise ValueError("it has a key twice")
+        raise ValueError("a key occurs twice")
     return content
 
 
@@ -220,7 +220,7 @@ def check_record(record: RobotRecord) -> None:
 
 
 def geometry_of(record: RobotRecord) -> Geometry:
-    """Return the geometry of a record's wheels, with fitted numbers at their start values."""
+    """Return the geometry of a record's wheels, with fitted parameters at their start values."""
     plain = Geometry(**vars(record.wheels))
     return replace(
         plain, drive_offset=jnp.zeros(plain.wheels), radius_deviation=jnp.zeros(plain.drives)

@@ -79,10 +79,10 @@ class ActuatorModel:
 
     @property
     def lag_gain(self) -> float:
-        """Share of the difference between set speed and wheel speed that a substep removes [1]."""
+        """Fraction of the difference between set and wheel speed that a substep removes [1]."""
         return 1 - float(np.exp(-self.substep / max(self.lag_s, 1e-6)))
 
-    def command_shares(self) -> Float[np.ndarray, "substep command"]:
+    def command_weights(self) -> Float[np.ndarray, "substep command"]:
         """Return the weights of the last commands, newest first, in the mean command of a substep.
 
         A command holds for a period and arrives after the delay. The weights are exact, and
@@ -180,7 +180,7 @@ class Twin(eqx.Module):
         """Return state and readings one period after a command [rad/s]."""
         old, b, h = state, self.actuators, self.actuators.substep
         ring = jnp.concatenate([command[None], old.ring[:-1]])
-        shares = jnp.asarray(b.command_shares())
+        shares = jnp.asarray(b.command_weights())
         pushes = noise[: 3 * b.substeps].reshape(-1, 3)
         pose, xi, wanted, w, angle = old.pose, old.twist, old.wanted, old.speed, old.angle
         for k in range(b.substeps):

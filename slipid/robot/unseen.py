@@ -5,8 +5,8 @@ site, the logarithm of roller drag rises with the logarithm of creep at a slope 
 without a run is assumed to be the geometric mean of the known floors, made softer or harder, with
 more friction or less. Currents and a gyro show which of these an unfamiliar floor resembles;
 without these sensors the hypothetical floors have little influence, since their prior probability
-is low. Their numbers are not identified, and the motion on them is uncertain by a tenth of the path
-length and 0.3 rad per metre.
+is low. Their parameters are not identified, and the motion on them is uncertain by a tenth of the
+path length and 0.3 rad per metre.
 """
 
 from dataclasses import replace
@@ -74,9 +74,9 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
 
 
 def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
-    """Return the numbers of the middle floor by name.
+    """Return the parameters of the middle floor, keyed by name.
 
-    They are geometric means over the known floors, and arithmetic means of numbers with a sign.
+    They are geometric means over the known floors; arithmetic means for parameters with a sign.
     """
     first = f"surface.{record.labels[0]}."
     middle_floor: dict[str, RecordedNumber] = {}

@@ -14,7 +14,7 @@ def in_blocks(of: Callable[..., Any], *rows: Any, block: int = BLOCK) -> Any:
     """Return the results of a compiled function for rows that do not depend on each other.
 
     JAX compiles a function anew for every shape. Here it sees blocks of one shape only; the last
-    block is filled up with copies of the last row.
+    block is padded with copies of the last row.
 
     Args:
         of: function of arrays with `block` rows, which returns a tree of such arrays.

@@ -29,7 +29,7 @@ LIBRARIES = (
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the `LIBRARIES`, on which results depend, by name."""
+    """Return the versions of Python and of `LIBRARIES`, on which results depend, keyed by name."""
     found = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
@@ -72,7 +72,7 @@ def key_of(*parts: object) -> str:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Finished parts of one job, by name, in files of one folder.
+    """Finished parts of one job, keyed by name, in files of one folder.
 
     A part is written completely or not at all. Damaged parts, and parts of other jobs, are treated
     as absent, so that they are computed again.

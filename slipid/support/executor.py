@@ -78,7 +78,7 @@ def results(
     Args:
         executor: executor of the jobs.
         work: function of a job, at the top level of a module.
-        todo: argument of each job, by the name of the job.
+        todo: argument of each job, keyed by the name of the job.
         report: reporter of the progress.
 
     Raises:

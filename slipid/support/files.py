@@ -77,8 +77,7 @@ def read_json(path: Path, what: str) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        DataError: the file is missing or not JSON; the message describes the expected content by
-            `what`.
+        DataError: the file is missing or not JSON; the message names `what` was expected.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))

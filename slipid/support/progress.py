@@ -61,7 +61,7 @@ class Reporter:
             self.line(f"{name} ...")
 
     def note(self, what: str) -> None:
-        """Show a text about the current activity beside the bar; without a bar, do nothing."""
+        """Show a text about the current activity next to the bar; without a bar, do nothing."""
         if self._task is not None:
             self._bars.update(self._task, what=what)
 

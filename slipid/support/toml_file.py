@@ -18,7 +18,7 @@ CLOSED = ConfigDict(extra="forbid")
 Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
 Part = Annotated[float, Field(ge=0, lt=1)]
-"""Share of a whole, at least 0 and below 1 [1]."""
+"""Fraction of a whole, at least 0 and below 1 [1]."""
 Model = TypeVar("Model")
 Step = str | int
 """Step of a location in a TOML file: the key of a table, or the index in a list."""
@@ -31,7 +31,7 @@ class Section(BaseModel):
 
 
 def text_of(path: Path, what: str = "a config") -> str:
-    """Return the text of a file; raise `DataError`, which describes it by `what`, if unreadable."""
+    """Return the text of a file; raise `DataError`, naming the expected `what`, if unreadable."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -96,7 +96,7 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
 def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
     """Return the steps to a mistake in the file, from the location that pydantic reports.
 
-    Pydantic's location also has names of union members, which are left out.
+    Pydantic's location also has names of union members, which are omitted.
     """
     steps: list[Step] = []
     here = mapping
@@ -133,7 +133,8 @@ def _below(here: object, step: Step) -> object:
 def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[object]:
     """Return the models and dataclasses that may describe a place in the file.
 
-    For a union, these are the members whose literals (such as `drive = "omni"`) match the file.
+    Of the members of a union, only those whose literals (such as `drive = "omni"`) match the file
+    are returned.
     """
     found, here = [root], mapping
     for step in steps:

@@ -75,7 +75,7 @@ WRONG = {
     "no size": ({"image_px": [0, 360]}, "image_px"),
     "no focal length": ({"matrix": [[0, 0, 1], [0, 1, 1], [0, 0, 1]]}, "expected .*f, 0, x"),
     "short matrix": ({"matrix": [[1, 0, 1], [0, 1, 1]]}, "matrix"),
-    "three of distortion": ({"distortion": [0.1, 0.1, 0.1]}, "3 numbers of distortion"),
+    "three of distortion": ({"distortion": [0.1, 0.1, 0.1]}, "3 distortion coefficients"),
     "a mirror": ({"rotation_from_world": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "not a rotation"),
     "stretched": ({"rotation_from_world": [[2, 0, 0], [0, -1, 0], [0, 0, -1]]}, "not a rotation"),
     "looks up": ({"rotation_from_world": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "looks up"),

@@ -171,7 +171,7 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
         (ExportOptions(()), "no form"),
         (ExportOptions(controller="contacts"), "no controller 'contacts', did you mean contact"),
         (ExportOptions(controller="contact_map"), "needs a map of the floors"),
-        (ExportOptions(map=Path("site.toml")), "does not use a map; leave out --map"),
+        (ExportOptions(map=Path("site.toml")), "uses no map; omit --map"),
         (ExportOptions(path="square"), "no path 'square'"),
         (ExportOptions(speed=9.0), "speed 9 m/s"),
     ],

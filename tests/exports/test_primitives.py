@@ -362,9 +362,9 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
 @pytest.mark.parametrize(
     ("run", "reason"),
     [
-        (lambda x: x.at[np.array([1, 1])].add(1.0), "a place that is written twice"),
-        (lambda x: x.at[jnp.argmin(x)].set(1.0), "places that are not known before"),
-        (lambda x: x.at[jnp.argmin(x)].get(mode="fill"), "places out of range that are filled"),
+        (lambda x: x.at[np.array([1, 1])].add(1.0), "an index that occurs twice"),
+        (lambda x: x.at[jnp.argmin(x)].set(1.0), "indices that are not constant"),
+        (lambda x: x.at[jnp.argmin(x)].get(mode="fill"), "indices out of range that give"),
         (lambda x: ~jnp.floor(x).astype(int), "of whole numbers"),
         (lambda x: jnp.abs(jnp.floor(x).astype(int)), "of whole numbers"),
         (lambda x: jnp.bitwise_and.reduce(jnp.floor(x).astype(int)), "of whole numbers"),

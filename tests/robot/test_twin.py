@@ -37,7 +37,7 @@ def driven(twin, commands, key=KEY):
 
 def test_commands_arrive_late_as_a_fine_grid_says():
     for delay in (0.0, 0.03, 0.12, 0.25):
-        share = ActuatorModel(delay_s=delay).command_shares()
+        share = ActuatorModel(delay_s=delay).command_weights()
         grid = (np.arange(100_000) + 0.5) / 100_000 * 0.05
         index = -np.floor((grid - delay) / 0.05).astype(int)
         brute = [[np.mean(part == k) for k in range(KEPT_COMMANDS)] for part in np.split(index, 2)]

@@ -108,7 +108,7 @@ def test_a_robot_enters_and_leaves_unseen_floors_as_a_whole():
     by_floor, ways = FloorFilter(wider, Settings()), hypotheses_of(wider)
     for start in (0, 5):
         alone = jnp.zeros((len(ways), 1)).at[ways.uniform[start]].set(1.0)
-        now = np.asarray(by_floor._estranged(alone, jnp.asarray(0.5)))[:, 0]
+        now = np.asarray(by_floor._unseen_changed(alone, jnp.asarray(0.5)))[:, 0]
         assert now.sum() == pytest.approx(1.0)
         assert (now[ways.uniform[2:]] > 0).all()
         assert now[ways.uniform[start]] > 0.97
@@ -117,7 +117,7 @@ def test_a_robot_enters_and_leaves_unseen_floors_as_a_whole():
         assert (all_told[ways.uniform[2:]] > 0).all()
     # from one floor that was driven on to another it comes wheel by wheel
     alone = jnp.zeros((len(ways), 1)).at[ways.uniform[0]].set(1.0)
-    assert float(by_floor._estranged(alone, jnp.asarray(0.5))[ways.uniform[1], 0]) == 0.0
+    assert float(by_floor._unseen_changed(alone, jnp.asarray(0.5))[ways.uniform[1], 0]) == 0.0
 
 
 @cache

@@ -123,7 +123,7 @@ _MARGIN = 12
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Letters that stand for motors that several wheels share."""
 LABEL_WIDTH = 3
-"""Largest number of characters of a wheel: its number, its arrow, and the letter of its motor."""
+"""Number of characters that show a wheel in the drawing: number, arrow, and letter of its motor."""
 
 
 def drawing(robot: Geometry) -> str:

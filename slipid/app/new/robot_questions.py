@@ -216,7 +216,8 @@ DRIVES: dict[str, tuple[RobotQuestion, ...]] = {
     "differential": (_TRACK,),
     "general": (_PLACES, _DIRECTIONS, _ROLLERS),
 }
-"""Questions about each type of drive, in order; they are followed by those in `COMMON`."""
+"""Questions for each type of drive, in the order in which they are asked; those in `COMMON`, for
+all types, are asked after them."""
 
 
 def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> RobotAnswers:

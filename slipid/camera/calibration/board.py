@@ -23,13 +23,14 @@ from slipid.support.errors import DataError
 LARGEST_M = 1.0
 """Largest edge of a square [m]; a larger number was probably meant in millimetres."""
 LEAST_CORNERS = 6
-"""Smallest number of corners in a view: a pose has six numbers, and each corner gives two."""
+"""Smallest number of corners in a view: a pose has six unknowns, and each corner gives two
+equations."""
 SEARCHED_PICTURES = 3
 """Number of pictures that are searched for other boards if the given board is not detected. It is
 small because every dictionary is tried on each picture."""
 ENOUGH_DETECTIONS = 4
-"""Smallest number of detected markers or corners that is taken as proof of a board: so many are
-hardly detected by chance."""
+"""Smallest number of detected markers or corners that is taken as proof of a board, since so many
+are unlikely by chance."""
 LEAST_VIEWS = 6
 """Smallest number of usable views, and of those that differ from each other."""
 SAME_VIEW = 0.08
@@ -51,7 +52,7 @@ class Picture:
 
 
 def named_pictures(words: Sequence[str]) -> list[Path]:
-    """Return the picture files named by words, each once, in their order.
+    """Return the picture files that command-line words name, each once, in the words' order.
 
     Args:
         words: files, folders and glob patterns.
@@ -276,13 +277,11 @@ def not_detected(board: Board, pictures: Sequence[Picture]) -> DataError:
         where = f"{pictures[0].path}: the board is not found in it"
     else:
         where = f"{pictures[0].path} and {len(pictures) - 1} more: the board is found in none"
-    return DataError(
-        f"{where}; looked for {board}; {_instead(board, pictures[:SEARCHED_PICTURES])}"
-    )
+    return DataError(f"{where}; looked for {board}; {_advice(board, pictures[:SEARCHED_PICTURES])}")
 
 
-def _instead(board: Board, pictures: Sequence[Picture]) -> str:
-    """Return a sentence that says what pictures show instead of the board, and what to do."""
+def _advice(board: Board, pictures: Sequence[Picture]) -> str:
+    """Return what markers pictures show although the board is not detected, with a remedy."""
     if other := _other_board(board, board.dictionary, pictures):
         return other
     name, numbers = visible_markers([picture.image for picture in pictures])
@@ -303,9 +302,9 @@ def _instead(board: Board, pictures: Sequence[Picture]) -> str:
 
 
 def _other_board(board: Board, dictionary: str, pictures: Sequence[Picture]) -> str | None:
-    """Return advice if pictures show a similar board, else None.
+    """Return advice if pictures show a similar board with markers of a dictionary, else None.
 
-    Similar boards have rows and columns swapped, the other legacy pattern, or this dictionary.
+    A similar board may have rows and columns swapped, the other legacy pattern, or both.
     """
     if marker_count(dictionary) < board.columns * board.rows // 2:
         return None

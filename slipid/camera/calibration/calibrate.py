@@ -133,16 +133,16 @@ def floor_from_board(
         size_std: relative std of the board's size [1].
     """
     fit = fit_place(str(picture), lens.lens, on_board(lens, board, picture, height_m))
-    return _reported(lens, fit, f"board on the floor in {picture.name}", size_std)
+    return _with_report(lens, fit, f"board on the floor in {picture.name}", size_std)
 
 
 def floor_from_points(lens: CalibratedLens, path: Path, size_std: float) -> FloorFit:
     """Return a camera's place, fitted to the measured points in a file.
 
-    `size_std` is the relative std of lengths by the tape with which they were measured [1].
+    `size_std` is the relative std of the measuring tape's scale [1].
     """
     fit = fit_place_robustly(str(path), lens.lens, read_points(path, lens.lens.image_px))
-    return _reported(lens, fit, f"points of {path.name}", size_std)
+    return _with_report(lens, fit, f"points of {path.name}", size_std)
 
 
 def straight_camera(
@@ -159,8 +159,8 @@ def straight_camera(
     return replace(camera, scale_std=size_std, report=report)
 
 
-def _reported(lens: CalibratedLens, fit: FloorFit, source: str, size_std: float) -> FloorFit:
-    """Return the fit with the report of lens and floor, and the std of lengths, in its camera."""
+def _with_report(lens: CalibratedLens, fit: FloorFit, source: str, size_std: float) -> FloorFit:
+    """Add the report of lens and floor, and the relative std of lengths, to the camera of a fit."""
     floor = floor_report(source, fit, uncertainty(fit, lens.covariance), size_std)
     report = {**lens.report, "floor": floor, "poor": lens.report.get("poor", []) + floor["poor"]}
     camera = replace(fit.camera, scale_std=floor["scale_std"], report=report)

@@ -25,8 +25,8 @@ exceeds it for one corner in 10^7."""
 HARMLESS_PX = 0.3
 """Residual below which no view or corner is excluded, since it is harmless [pixel]."""
 MOST_VIEWS_EXCLUDED = 0.25
-"""Largest share of the views that may be excluded; if more do not fit, it is not clear which ones
-are right [1]."""
+"""Largest fraction of the views that may be excluded; if more do not fit, it is not clear which
+ones are right [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def fit_lens(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> Lens
     poses = [Pose(np.ravel(r), np.ravel(t)) for r, t in zip(fit[3], fit[4], strict=True)]
     finite = np.isfinite(np.concatenate([parameters_of(lens), *(pose.shift for pose in poses)]))
     if not finite.all():
-        raise indeterminate("the fit of the lens does not end at numbers")
+        raise indeterminate("the fit of the lens diverges")
     return _with_covariance(lens, list(views), poses)
 
 

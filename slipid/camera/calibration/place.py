@@ -20,9 +20,10 @@ LEAST_TO_DROP = 6
 LEAST_TO_TEST = 5
 """Number of points below which the fit cannot show which of them is bad."""
 MOST_POINTS_EXCLUDED = 0.25
-"""Largest share of the points that may be excluded [1]."""
+"""Largest fraction of the points that may be excluded [1]."""
 TWIN_RATIO = 2.0
-"""Ratio of the errors of two poses below which the points hardly distinguish the two [1]."""
+"""Ratio of the errors of two poses below which the points do not clearly decide between them
+[1]."""
 LEAST_STD_PX = 0.03
 """Smallest std assumed for the error of a point [pixel], since few points may by chance fit better
 than corners can be detected."""
@@ -30,7 +31,7 @@ STEP_IN_STDS = 0.01
 """Step of numerical derivatives, in stds of the variable [1]."""
 GRID_POINTS = 5
 INNER_SHARE = 0.8
-"""Share of the picture's width and height in which lengths on the floor are compared [1]."""
+"""Fraction of the picture's width and height in which lengths on the floor are compared [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +198,7 @@ class PlaceUncertainty:
         pose: covariance of turn [rad] and shift [m], including the lens's uncertainty.
         place_std_m: std of the lens's place in the world [m].
         tilt_std_deg: std of the angle between the lens's axis and straight down [deg].
-        scale_std: relative std of lengths on the floor, without that of the board's size [1].
+        scale_std: relative std of lengths on the floor if the board's size were exact [1].
     """
 
     pose: Float[np.ndarray, "6 6"]

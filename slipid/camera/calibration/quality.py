@@ -26,8 +26,8 @@ LEAST_TILTED = 3
 CELLS = (8, 6)
 """Numbers of cells across and down into which the picture is divided, to measure coverage."""
 REFUSED_SHARE, POOR_SHARE = 0.35, 0.6
-"""Share of the cells with corners below which a lens is refused, and below which it is reported as
-poor [1]."""
+"""Fraction of the cells with corners below which a lens is refused, and below which it is reported
+as poor [1]."""
 POOR_REACH = 0.6
 REFUSED_FOCAL, POOR_FOCAL = 0.02, 0.005
 """Relative std of the focal lengths above which a lens is refused, and above which it is reported
@@ -44,8 +44,8 @@ class Coverage:
 
     Attributes:
         visited: cells of the picture that contain corners, beginning at the upper left.
-        reach: how near board corners come to each of the picture's four corners, as a share of the
-            distance from the picture's middle; the smallest of the four values [1].
+        reach: how near board corners come to each of the picture's four corners, as a fraction of
+            the distance from the picture's middle; the smallest of the four values [1].
     """
 
     visited: Bool[np.ndarray, "down across"]
@@ -53,7 +53,7 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Share of the picture's cells that contain corners [1]."""
+        """Fraction of the picture's cells that contain corners [1]."""
         return float(self.visited.mean())
 
 

@@ -127,7 +127,7 @@ def _line(path: Float[np.ndarray, "step 2"], tolerance: float) -> Float[np.ndarr
         return np.concatenate([halves[0][:-1], halves[1]])
     reverse = tuple(path[::-1].ravel()) < tuple(path.ravel())
     path = path[::-1] if reverse else path
-    # the ends of a step lie half a step beside a slanted border, its middle lies on the border
+    # the ends of a step lie up to half a step off a slanted border, its middle lies on the border
     middles = np.concatenate([path[:1], (path[1:] + path[:-1]) / 2, path[-1:]])
     twice = np.rint(2 * middles).astype(np.int32)
     few = cv2.approxPolyDP(twice.reshape(-1, 1, 2), 2 * tolerance, False).reshape(-1, 2)

@@ -28,12 +28,12 @@ from slipid.camera.opencv import Labels, Mask, cv2
 from slipid.support.errors import DataError
 
 JOIN_LIMITS = (5.0, 7.0, 8.0, 8.0, 8.0)
-"""Distance of colours up to which patches count as one surface, in each round [units of CIELAB]."""
+"""Largest distance of colours of patches that count as one surface, per round [units of CIELAB]."""
 SEPARATE_FROM = 7.0
-"""Distance of colours from which on patches are proposed as two surfaces [units of CIELAB]. It is
-small, since users can easily give two proposed surfaces one name, but hardly split one."""
+"""Smallest distance of colours of patches that are proposed as two surfaces [units of CIELAB]. It
+is small, since users can easily give two proposed surfaces one name, but not easily split one."""
 LEAST_PART = 0.002
-"""Share of the floor below which a patch is too small to propose a surface [1]."""
+"""Fraction of the floor below which a patch is too small to propose a surface [1]."""
 LIGHTNESS_WEIGHT = 0.8
 """Weight of a difference of lightness relative to one of a or b [1]; it is below 1 since shading
 changes lightness."""
@@ -44,7 +44,7 @@ ABOUT_SAMPLES = 4000
 MOST_POINTS = 4
 """Largest number of points that mark a surface."""
 MATCH_LIMITS = (8.0, 10.0, 12.0, 14.0, 16.0, 16.0)
-"""Distance of colours up to which a patch matches a given one, in each round [units of CIELAB]."""
+"""Largest distance of a patch's colour from a given one that it matches, per round [CIELAB]."""
 CLEAR_RATIO = 0.7
 """Largest ratio of a patch's distance to the nearest colour and to the second nearest colour with
 which it still matches the nearest one [1]."""
@@ -68,7 +68,7 @@ class Patches:
 
 
 def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCells:
-    """Return points on surfaces proposed without a config, numbered from the largest surface on.
+    """Return points on surfaces proposed without a config; surface 0 is the largest.
 
     Args:
         features: features of every cell.

@@ -135,7 +135,7 @@ def points_text(name: str, colour: str, share: float, pixels: Float[np.ndarray, 
     Args:
         name: name of the surface.
         colour: its colour `#rrggbb`, for a comment.
-        share: share of the mapped floor that it covers [1], for a comment.
+        share: fraction of the mapped floor that it covers [1], for a comment.
         pixels: points on the surface in the picture [pixel].
     """
     points = ", ".join(f"[{x:.0f}, {y:.0f}]" for x, y in pixels.tolist())

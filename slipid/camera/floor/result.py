@@ -18,13 +18,13 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError
 
 HARDLY_DISTINCT, NOT_DISTINCT = 5.0, 3.5
-"""Differences of appearance below which two surfaces are hardly distinguishable, and below which
-they are indistinguishable [spreads within a surface].
+"""Differences of appearance below which two surfaces are reported as hard to distinguish, and as
+indistinguishable [spreads within a surface].
 
-If one surface is given two names, the two differ by about 3.2: each takes one half of the noise.
+If one surface is given two names, the two differ by about 3.2, since the noise is divided in two.
 """
 MOST_UNKNOWN = 1 / 3
-"""Largest share of the requested floor that may be unknown in a good map [1]."""
+"""Largest fraction of the requested floor that may be unknown in a good map [1]."""
 MOST_NAMED = 3
 """Number of patches of low confidence that are reported one by one, the largest first."""
 WEAK_CONFIDENCE = 1.0
@@ -56,7 +56,7 @@ class PictureMap:
     proposal: str | None
 
     def share(self, k: int) -> float:
-        """Return the share of the known floor that surface number `k` covers [1]."""
+        """Return the fraction of the known floor that surface number `k` covers [1]."""
         return float((self.labels == k).sum() / max(1, int((self.labels >= 0).sum())))
 
     def to_json(self) -> Content:
@@ -135,7 +135,7 @@ def map_from(
 def _similar(
     surfaces: Surfaces, names: tuple[str, ...], present: list[int]
 ) -> tuple[list[str], list[str]]:
-    """Return sentences about pairs of surfaces that cannot or can hardly be distinguished.
+    """Return sentences about pairs of surfaces that are hard or impossible to distinguish.
 
     The difference of appearances is the median over the picture, relative to the spread within a
     surface.

@@ -23,7 +23,7 @@ from slipid.camera.opencv import Labels, Mask, cv2
 
 MOST_ROUNDS = 10
 STEADY_SHARE = 3e-4
-"""Share of cells that change their surface in a round below which learning ends [1]."""
+"""Fraction of cells that change their surface in a round below which learning ends [1]."""
 COARSE_CELLS = 25_000
 """Approximate number of cells of the low resolution picture from which surfaces are learnt."""
 MOST_SAMPLES = 5_000
@@ -200,7 +200,7 @@ def _updated(
     own = np.concatenate([labels[cells], seeds.marked[:, 2]])
     cells = np.concatenate([cells, marked])
     count = np.bincount(own, minlength=len(seeds.colours))
-    # every surface contributes to the illumination, however small it is
+    # small surfaces get larger weights, so that all contribute to the illumination
     weight = 1 / np.sqrt(count[own])
     weight[len(weight) - len(marked) :] *= 3
     at, appearance = (
@@ -230,17 +230,17 @@ def labelled(costs: Costs, visible: Mask) -> Labels:
 def smoothed(costs: Costs, visible: Mask) -> Labels:
     """Return labels of low cost that agree with those of neighbouring cells.
 
-    The method is the mean field of a Potts model: each cell has a share of every surface, and the
-    shares of its neighbours reduce the costs of their surfaces. Cells that are not visible do not
-    affect others and get the label `UNKNOWN`.
+    The method is the mean field of a Potts model: each cell has a probability for every surface,
+    and the probabilities of its neighbours reduce the cost of their surfaces. Cells that are not
+    visible do not affect others and get the label `UNKNOWN`.
     """
     weight = visible.astype(np.float32)
     around = np.maximum(cv2.GaussianBlur(weight, (0, 0), NEIGHBOUR_STD), 1e-3)
     total = costs
     for _ in range(FIELD_ROUNDS):
-        share = np.exp(-0.5 * (total - total.min(axis=0)))
-        share *= weight / share.sum(axis=0)
-        neighbours = np.stack([cv2.GaussianBlur(one, (0, 0), NEIGHBOUR_STD) for one in share])
+        chance = np.exp(-0.5 * (total - total.min(axis=0)))
+        chance *= weight / chance.sum(axis=0)
+        neighbours = np.stack([cv2.GaussianBlur(one, (0, 0), NEIGHBOUR_STD) for one in chance])
         total = costs - 2 * NEIGHBOUR_COST * neighbours / around
     return np.where(visible, np.argmin(total, axis=0), UNKNOWN)
 
@@ -276,7 +276,7 @@ def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
 
 
 def _nearest(labels: Labels, kept: Mask) -> Labels:
-    """Return labels with that of the nearest kept cell in every cell; no change if none is kept."""
+    """Give every cell the label of the nearest kept cell; no change if no cell is kept."""
     from scipy.ndimage import distance_transform_edt
 
     if kept.all() or not kept.any():

@@ -22,14 +22,14 @@ CHECKPOINT_S = 10.0
 CHECKPOINT_NAME = "sightings"
 """Name under which a checkpoint stores the detections."""
 KINDS = {"frame": int, "time": float, "repeated": bool, "row": int, "id": int, "corners": float}
-"""Kind of the numbers of each attribute of `Detections`."""
+"""Number type of each attribute of `Detections`."""
 FIRST_FRAMES = 100
-"""Number of frames without any wanted marker after which a message lists the visible markers."""
+"""Number of frames after which a message lists the visible markers if none is a tracked one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """All detections of the wanted markers in all frames.
+    """All detections of the tracked markers in all frames.
 
     Attributes:
         frame, time: number and time [s] of every frame.
@@ -48,7 +48,7 @@ class Detections:
 
     @classmethod
     def of(cls, lists: dict[str, list[Any]]) -> "Detections":
-        """Return the detections in lists, given by the names of the attributes."""
+        """Return the detections as arrays from lists, which are keyed by the attributes' names."""
         arrays = {name: np.array(lists[name], kind) for name, kind in KINDS.items()}
         return cls(**arrays | {"corners": arrays["corners"].reshape(-1, 4, 2)})
 
@@ -73,7 +73,7 @@ def detect_all(
     """Return the detections in every frame, continuing from a checkpoint if there is one.
 
     Raises:
-        DataError: no frame shows any wanted marker; the message lists the visible markers.
+        DataError: no frame shows any tracked marker; the message lists the visible markers.
     """
     kept = checkpoint.load(CHECKPOINT_NAME) or {}
     log = {name: list(kept.get(name, ())) for name in KINDS}
@@ -117,7 +117,7 @@ def detect_all(
 
 
 def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
-    """Return advice if a picture shows markers, but none of the wanted ones; None otherwise."""
+    """Return advice if a picture shows markers, but none of the tracked ones; None otherwise."""
     wanted = ", ".join(map(str, sorted(tracker.ids)))
     visible = {d.id for d in tracker.detector.detect(grey, tracker.region)}
     if others := sorted(visible - tracker.ids):

@@ -1,7 +1,7 @@
 """Detection of markers in frames, near their last place and periodically in the whole frame.
 
 OpenCV searches a whole frame in tens of milliseconds and the surroundings of a marker in one. If
-every wanted marker was detected in the last frame and is detected again near its expected place,
+every tracked marker was detected in the last frame and is detected again near its expected place,
 the rest of the frame is skipped. Every `WHOLE_INTERVAL`-th frame is searched completely, so that a
 second marker of the same number is detected.
 
@@ -28,12 +28,12 @@ the picture [1]."""
 LEAST_MARGIN = 12.0
 """Smallest margin of the search region [pixel]: the detector ignores markers at its border."""
 REFINEMENTS = 3
-"""Number of times that edges are sampled and corners refined; the first time starts from corners
-with errors of about a pixel."""
+"""Number of times that edges are sampled and corners refined, starting from corners with errors of
+about a pixel."""
 ALONG, ACROSS = 20, 11
 """Number of places along an edge, and number of brightness samples across it at each place."""
 END_SHARE = 0.12
-"""Share of an edge's length that is left out at each end, where the next edge is near [1]."""
+"""Fraction of an edge's length that is not sampled at each end, near the next edge [1]."""
 SAMPLED_REACH = 0.6
 """Distance up to which brightness is sampled on both sides of an edge, in squares of the marker
 [1]; beyond one square lies the inner pattern."""
@@ -44,7 +44,7 @@ LEVEL_SAMPLES = 3
 LEAST_CONTRAST = 12.0
 """Difference of the bright and the dark level below which there is no edge [grey levels]."""
 LEAST_OUTLIER = 0.15
-"""Distance from the fitted line below which a point of an edge is never left out [pixel]."""
+"""Distance from the fitted line below which a point of an edge is never excluded [pixel]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +126,9 @@ class MarkerTracker:
 
     Attributes:
         detector: detector of the markers.
-        ids: numbers of the wanted markers.
+        ids: numbers of the markers to track.
         region: region of the picture to which detections are limited.
-        last: last detection of each wanted marker.
+        last: last detection of each marker to track.
         speed: motion of each marker's middle between the last two frames [pixel].
         twice: whether a marker was detected twice in the last frame; the next frame is then
             searched completely, so that the tracker does not follow the wrong one.
@@ -142,7 +142,7 @@ class MarkerTracker:
     twice: bool = False
 
     def detect(self, grey: Grey, number: int) -> list[Detection]:
-        """Return all detections of the wanted markers in frame number `number`."""
+        """Return all detections of the markers to track in frame number `number`."""
         if self.ids == self.last.keys() and not self.twice and number % WHOLE_INTERVAL:
             near = [d for d in self.detector.detect(grey, self._around()) if d.id in self.ids]
             if self.ids == {d.id for d in near}:

@@ -67,7 +67,7 @@ def write_poses(path: Path, track: TrackedPoses) -> None:
 
 
 def _columns(track: TrackedPoses) -> dict[str, np.ndarray]:
-    """Return the columns of `_FORMATS` by name, with NaN for empty cells."""
+    """Return the columns of `_FORMATS` keyed by name, with NaN for empty cells."""
     p, c, r = track.pose, track.covariance, track.rejected
     values = (
         *(track.time, p[:, 0], p[:, 1], p[:, 2]),

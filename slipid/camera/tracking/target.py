@@ -197,7 +197,7 @@ def _target(given: _Target, where: str) -> Target:
 def _check_distinct(targets: Sequence[Target], where: str) -> None:
     """Raise `DataError` if a number or a name occurs twice, or dictionaries differ."""
     if len({target.name for target in targets}) < len(targets):
-        raise DataError(f"{where}: two targets with one name; expected names of their own")
+        raise DataError(f"{where}: two targets with one name; expected different names")
     if len({target.dictionary for target in targets}) > 1:
         raise DataError(f"{where}: targets in several dictionaries; expected one for all")
     ids = [marker.id for target in targets for marker in target.markers]

@@ -202,7 +202,7 @@ WRONG_SIZE = 0.02
 """Largest relative difference of the median apparent size from the true one; a larger one shows a
 wrong height or size of the markers [1]."""
 LEAST_TRACKED = 0.5
-"""Share of frames with a pose below which a result is doubtful [1]."""
+"""Fraction of frames with a pose below which a result is doubtful [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +240,7 @@ class TrackedPoses:
 
     @property
     def share(self) -> float:
-        """Share of the frames that have a pose [1]."""
+        """Fraction of the frames that have a pose [1]."""
         return float(self.good.mean()) if len(self.flag) else 0.0
 
     @property

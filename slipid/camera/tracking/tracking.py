@@ -104,7 +104,7 @@ def track(
 
     Raises:
         DataError: frames do not have the size at which the camera was calibrated, no frame shows a
-            wanted marker, or times do not increase.
+            marker of the bodies, or times do not increase.
     """
     camera.lens.check_size(source.image_px, source.name)
     for target in targets:
@@ -112,7 +112,7 @@ def track(
     ids = frozenset(number for target in targets for number in target.ids)
     if region is not None and region.within(Region(0, 0, *camera.lens.image_px)).empty:
         width, height = camera.lens.image_px
-        raise DataError(f"--region lies outside; expected a part of 0,0,{width},{height}")
+        raise DataError(f"--region is outside the picture; expected part of 0,0,{width},{height}")
     dictionary = targets[0].dictionary
     kept = Checkpoint(
         checkpoint,

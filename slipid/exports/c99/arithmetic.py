@@ -1,7 +1,8 @@
 """Rules that convert arithmetic primitives of JAX to C: element-wise, reductions, products.
 
 A product with a constant 0 is omitted from a sum of products. The result is the same for finite
-numbers, but infinity and NaN do not propagate through such a product as they would in JAX.
+numbers, but infinity or NaN times such a 0 counts as 0, where JAX gives NaN. The words lane, row
+and cell are defined in `slipid.exports.c99.ir`.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ from slipid.exports.fields import Kind, kind_of
 Shaped = jax.ShapeDtypeStruct
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[Builder, tuple[Cell, ...], int], Cell | None]
-"""Function that returns an existing cell equal to the result of an operation, given its operands
-and the number of lanes of the result; None if the operation must be computed."""
+"""Function that simplifies an operation, given its operands and the number of lanes of the result.
+
+It returns a cell that equals the result, such as an operand; None if nothing can be simplified."""
 
 
 UNARY = {
@@ -68,9 +70,10 @@ BINARY = {
     "sub": "{0} - {1}",
 }
 INTEGER_TEMPLATES = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
-"""Templates of operations that have another form in C for whole numbers."""
+"""Templates of operations whose C expression differs for integers."""
 NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (None, 1.0)}
-"""Neutral numbers of an operation as its first and as its second operand; None if there is none."""
+"""Neutral elements of each operation: the value of the first operand, and that of the second one,
+with which the result equals the other operand; None if there is no such value."""
 
 
 def applied(
@@ -81,10 +84,7 @@ def applied(
     shape: tuple[int, ...],
     simpler: Simpler | None = None,
 ) -> Array:
-    """Return the array computed by a C expression from each element of some arrays.
-
-    Arrays are broadcast to the shape.
-    """
+    """Broadcast arrays to a shape and apply a C expression to them element by element."""
     axis = _axis(values, shape)
     rows = [along(builder, v, shape, axis) for v in values]
     lanes = 0 if axis is None else shape[axis]
@@ -98,7 +98,8 @@ def applied(
 def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
     """Return the axis of the lanes of an element-wise result.
 
-    It is that of the first value with lanes along which the result is equally long.
+    It is the axis of the first value with lanes whose lanes are not broadcast. Without such a value
+    it is the longest axis of a result of more than `MOST_UNROLLED` elements, else None.
     """
     for value in values:
         axis = axis_of(value)
@@ -108,7 +109,7 @@ def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
 
 
 def unary(name: str) -> Rule:
-    """Return the rule of a function of one number."""
+    """Return the rule of a function of one operand."""
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         if UNARY[name] == "{0}":
@@ -121,7 +122,7 @@ def unary(name: str) -> Rule:
 
 
 def binary(name: str) -> Rule:
-    """Return the rule of a function of two numbers; tanh(a) / b becomes one call."""
+    """Return the rule of a function of two operands; tanh(a) / b becomes one call."""
     first, second = NEUTRAL.get(name.removesuffix("_any"), (None, None))
 
     def simpler(builder: Builder, cells: tuple[Cell, ...], lanes: int) -> Cell | None:
@@ -143,7 +144,7 @@ def binary(name: str) -> Rule:
 
 
 def integer_pow(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return an integer power, computed by multiplications."""
+    """Return an array raised to an integer power by repeated multiplication."""
     power = params["y"]
     if power == 0:
         raise NoFormError("a power of 0")
@@ -163,7 +164,7 @@ CONVERTED: dict[tuple[Kind, Kind], str] = {
 
 
 def converted(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return the numbers converted to another kind."""
+    """Return an array converted to another kind of number."""
     pair = kind_of_value(values[0]), kind_of(out.dtype)
     if pair[0] == pair[1]:
         return values[0]
@@ -171,7 +172,7 @@ def converted(builder: Builder, values: list[Value], params: Params, out: Shaped
 
 
 def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return the first or second of two numbers, selected by a condition."""
+    """Choose between two arrays element by element: the second one where a condition is true."""
 
     def simpler(builder: Builder, cells: tuple[Cell, ...], lanes: int) -> Cell | None:
         which, no, yes = cells
@@ -228,7 +229,7 @@ def reduced(name: str) -> Rule:
 
 
 def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return the index of the first lane that has the least number or NaN."""
+    """Return the index of the smallest element, or of the first NaN if there is one."""
     value = values[0]
     if len(value.shape) > 1 or kind_of_value(value) != "real":
         raise NoFormError("an argmin of other than one axis of reals")
@@ -270,7 +271,10 @@ def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> V
 def _ordered(
     cells: Cells, shape: tuple[int, ...], axis: int | None, order: Sequence[Sequence[int]]
 ) -> Cells:
-    """Return cells with lanes along `axis`, with one axis for each group of axes in `order`."""
+    """Transpose cells to the order of axes in `order`, and merge each group of axes into one.
+
+    Axes are counted in `shape`, the array's; `axis`, the axis of the lanes, is absent in cells.
+    """
     dims = [d for d in range(len(shape)) if d != axis]
     groups = [[d for d in part if d != axis] for part in order]
     turned = np.transpose(cells, [dims.index(d) for group in groups for d in group])
@@ -283,9 +287,10 @@ def _lane_axes(
     batch: Sequence[Sequence[int]],
     free: Sequence[Sequence[int]],
 ) -> tuple[int | None, int | None]:
-    """Return the axes of the lanes of a product in its left and its right array.
+    """Return the axis along which a product loops, in its left and in its right array.
 
-    They are those of an array that has lanes; None where an array does not depend on the lane.
+    It is the axis of lanes of one of the two; None for an array that lacks this axis, and for both
+    if neither array has lanes.
     """
     left, right = map(axis_of, values)
     if right in free[1]:

@@ -1,9 +1,9 @@
 """Builder that places each statement of a function in a block of code.
 
-Every number is computed once, in the earliest block that has its inputs. A block is straight-line
-code or one loop over lanes (the elements along one axis of an array), so that many operations on
-the same lanes form one loop. Values that are the same in all iterations of a repetition are
-computed before it.
+Every expression is computed once, in the earliest block that has its inputs. A block is
+straight-line code or one loop over lanes (the elements along one axis of an array), so that many
+operations on arrays of one length share one loop. Expressions that are the same in all iterations
+of a repetition are computed before it.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from slipid.exports.c99.ir import (
 from slipid.exports.fields import DTYPES, Kind
 
 CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
-"""Functions of C's library whose calls prevent a compiler from vectorizing a loop."""
+"""Beginnings of calls of C's library, which prevent a compiler from vectorizing a loop."""
 
 
 class Names:
-    """Numbers that make the names in a generated file unique, and the file's constant tables."""
+    """Serial numbers for the names in a generated file, and the file's constant tables."""
 
     def __init__(self) -> None:
         self._last = 0
         self.tables: dict[tuple[Kind, bytes], Memory] = {}
 
     def number(self) -> int:
-        """Return a new number."""
+        """Return the next serial number."""
         self._last += 1
         return self._last
 
     def table(self, values: np.ndarray, kind: Kind) -> Memory:
-        """Return memory that contains these constants, an existing table if one is equal."""
+        """Return a table of these constants, shared with earlier requests for equal constants."""
         flat = np.ascontiguousarray(values.reshape(-1), dtype=DTYPES[kind])
         key = (kind, flat.tobytes())
         if key not in self.tables:
@@ -53,11 +53,11 @@ class Builder:
 
     Attributes:
         parent: builder of the code around it.
-        turns: block that repeats this code; None if it is not repeated.
-        blocks: blocks in their order.
+        turns: block that repeats this code; None outside of repetitions.
+        blocks: blocks in order of execution.
         source: file and line of the Python code that the next statement is generated from.
-        contiguous: arrays that are also stored in row-major order, with that memory, by the
-            identity of their cells.
+        contiguous: arrays that are also stored in row-major order, with that memory, keyed by the
+            `id` of their cells.
     """
 
     def __init__(self, names: Names, parent: Builder | None = None):
@@ -76,13 +76,13 @@ class Builder:
         lanes: int = 0,
         start: str = "",
     ) -> Variable:
-        """Return a variable computed from cells, an existing one if it was computed before.
+        """Return the variable of an expression, after appending its statement if it is new.
 
         Args:
             kind: kind of the number.
-            template: C expression with places {0}, {1}, ... for the cells.
-            cells: cells for these places.
-            lanes: number of lanes; cells that are alike in all of them make a single number, too.
+            template: C expression with the placeholders {0}, {1}, ... for the cells.
+            cells: cells for these placeholders.
+            lanes: number of lanes; ignored if no cell varies over the lanes and nothing is reduced.
             start: initial value of a reduction over the lanes to one number; empty for none.
         """
         lanes = lanes if start or any(map(varies, cells)) else 0
@@ -104,12 +104,12 @@ class Builder:
         return self._known[key]
 
     def array(self, kind: Kind, size: int, cells: tuple[Cell, ...], lanes: int = 0) -> Memory:
-        """Return new memory that straight-line code, or a loop over lanes, fills from cells."""
+        """Return new memory, placed in the earliest block in which `cells` are available."""
         home = self._around(cells)._place(cells, lanes)
         return Memory(f"m{self.names.number()}", kind, size, home)
 
     def fill(self, memory: Memory, template: str, cell: Cell, times: int = 0) -> None:
-        """Append a C statement that fills memory made by `array`, in a loop if `times` is not 0."""
+        """Append a C statement that writes to memory from `array`, looping if `times` is not 0."""
         block = memory.home
         assert block is not None
         block.statements.append(
@@ -123,16 +123,17 @@ class Builder:
         return block
 
     def _around(self, cells: tuple[Cell, ...]) -> Builder:
-        """Return the builder for a statement: outside of repetitions that do not change its cells.
+        """Return the builder for a statement that reads these cells.
 
-        These are the cells that the statement reads.
+        It is the innermost one whose repetition changes any of the cells, so that the statement is
+        moved out of all other repetitions.
         """
         if self.parent is None or self.turns is None or any(map(self._changes, cells)):
             return self
         return self.parent._around(cells)
 
     def _changes(self, cell: Cell) -> bool:
-        """Return whether a cell may change between iterations of this repetition."""
+        """Return whether a cell may have different values in two iterations of this repetition."""
         if isinstance(cell, At):
             home = cell.memory.home
             by_index = cell.index is not None and self._changes(cell.index)
@@ -140,10 +141,9 @@ class Builder:
         return isinstance(cell, Variable) and cell.home.owner is self
 
     def _place(self, cells: tuple[Cell, ...], lanes: int, calls: bool = False) -> CodeBlock:
-        """Return the earliest block for a statement over these lanes that uses these cells.
+        """Return the earliest block for a statement with this number of lanes and these cells.
 
-        Loops whose statements call functions are kept apart from loops that a compiler can
-        vectorize.
+        Loops with calls or reductions are separate from loops that a compiler can vectorize.
         """
         apart = calls and lanes > 0
         first = max((self._after(cell, lanes) for cell in cells), default=0)

@@ -85,12 +85,12 @@ class Code:
 
     @property
     def kept(self) -> int:
-        """Count of the numbers in the state of estimator, controller and path."""
+        """Size of the states of estimator, controller and path, counted in numbers."""
         return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
 
     @property
     def scratch(self) -> int:
-        """Largest count of numbers that a function keeps in arrays on the stack."""
+        """Largest total size of a function's arrays on the stack, counted in numbers."""
         return max(f.scratch for f in self.functions)
 
     def header(self) -> str:

@@ -22,11 +22,14 @@ FILLED_FILES = (
     *("test/golden.h", "test/check.c", "examples/drive/drive.c", "examples/Slipid/Slipid.ino"),
     *("CMakeLists.txt", "library.json", "library.properties", "README.md"),
 )
-"""Files that are filled from the template of the same name, besides the code itself."""
+"""Files, besides the code itself, that are written from the template of the same name."""
 
 
 def _golden(code: Code) -> dict[str, str | list[str]]:
-    """Return the values of golden.h: the steps as tables, and code that fills and reads structs."""
+    """Return the texts for the template of golden.h, keyed by their placeholders.
+
+    They are the reference steps as tables, and C code that writes and reads the structs.
+    """
     steps = golden(code.loop)
     names = [f.name for f in code.estimate.fields for _ in range(f.size)]
     return {
@@ -74,9 +77,9 @@ class Recording:
     Attributes:
         plant: description of the plant.
         start: pose at which the run began [m, m, rad].
-        given: inputs of each step: dt [s] and the arrays of the reading, one after the other.
-        command: wheel speeds [rad/s].
-        time: time of the path [s].
+        given: inputs of each step: dt [s] and all arrays of the reading, concatenated.
+        command: commanded wheel speeds [rad/s].
+        time: time along the path, which waits for a robot that lags [s].
     """
 
     plant: str
@@ -104,13 +107,13 @@ def c_files(
     path: Path,
     recording: Recording | None = None,
 ) -> dict[str, str]:
-    """Return the text of the files by their paths in the folder.
+    """Return the text of each file, keyed by its path in the folder.
 
     Args:
         robot: robot with the record of its numbers.
         loop: estimator and controller.
         path: path that the example follows.
-        recording: a run along the path, with which the example is tested.
+        recording: closed-loop run along the path, whose commands the example must reproduce.
 
     Raises:
         UnsupportedError: a step uses a primitive that has no form in C.

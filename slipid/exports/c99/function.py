@@ -1,4 +1,4 @@
-"""A traced function as a C function: its arguments, its body, and the memory that it reads."""
+"""Translation of a traced function to a C function with arguments, body and memory."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Argument:
     Attributes:
         name: name of the argument.
         struct: struct that the argument points to; one without a name for plain numbers.
-        read: whether the function reads it.
-        written: whether the function fills it.
+        read: True if the function reads the argument.
+        written: True if the function writes the argument.
     """
 
     name: str
@@ -42,17 +42,17 @@ class Argument:
 
     @property
     def made(self) -> Argument:
-        """The same argument where the function fills it."""
+        """The same argument for a function that writes it without reading it."""
         return replace(self, read=False, written=True)
 
     @property
     def changed(self) -> Argument:
-        """The same argument where the function reads and changes it."""
+        """The same argument for a function that both reads and writes it."""
         return replace(self, written=True)
 
     @property
     def values(self) -> list[tuple[Memory, tuple[int, ...]]]:
-        """Memory and shape of each of its fields."""
+        """Memory and shape of each field of the argument."""
         fields = self.struct.fields
         plain = f"(*{self.name})" if self.written and not fields[0].shape else self.name
         names = [f"{self.name}->{f.name}" if self.struct.name else plain for f in fields]
@@ -63,7 +63,7 @@ class Argument:
 
     @property
     def declared(self) -> str:
-        """Text of its declaration in the function's head."""
+        """C text that declares the argument in the function's head."""
         const, field = "" if self.written else "const ", self.struct.fields[0]
         if self.struct.name:
             return f"{const}slipid_{self.struct.name} *{self.name}"
@@ -81,7 +81,7 @@ class Function:
         arguments: arguments in order.
         lines: lines of its body.
         reads: names of all memory that it reads.
-        scratch: count of the numbers in its arrays on the stack.
+        scratch: total size of its arrays on the stack, counted in numbers.
     """
 
     name: str
@@ -104,14 +104,14 @@ class Function:
 def function(
     names: Names, name: str, arguments: Sequence[Argument], run: Callable[..., object]
 ) -> Function:
-    """Return a function of JAX as a C function.
+    """Translate a function of JAX to a C function.
 
     Args:
-        names: numbers for names and constant tables of the generated file.
-        name: name of the function.
-        arguments: arguments in order.
-        run: function whose inputs are the trees of all arguments that are read and whose results
-            are those of all arguments that are written, in the arguments' order.
+        names: unique names and constant tables of the generated file.
+        name: name of the C function.
+        arguments: arguments of the C function in order.
+        run: function of JAX. Its inputs are the trees of all arguments that are read, and its
+            results the trees of all arguments that are written, both in the arguments' order.
 
     Raises:
         UnsupportedError: the function uses a primitive without a rule.
@@ -140,9 +140,9 @@ def function(
 
 
 def traced(run: Callable[..., object], *like: object) -> Traced:
-    """Return a function of trees, traced as a function of their leaves.
+    """Trace a function of trees as a function of their leaves, which returns leaves.
 
-    Its results are the leaves of the result tree. `like` are example arguments.
+    `like` are example arguments.
     """
     structure = jax.tree.structure(like)
 

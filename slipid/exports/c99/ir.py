@@ -1,9 +1,14 @@
-"""Intermediate representation of a traced function: numbers, loops over lanes, and their blocks.
+"""Intermediate representation of a traced function: arrays of cells, statements, and their blocks.
 
-An array is a numpy array of cells, one for every number. A long array has one axis along which the
-C code loops; the elements along it are its lanes, and each of its cells then stands for a whole row
-of numbers along that axis. All other axes are unrolled, so that slicing, stacking or transposing an
-array only rearranges its cells and takes no time on the robot.
+Words of the code generator:
+    lane: element along the one axis of a long array over which the C code loops, with index `l`.
+    row: all elements of an array along an axis, one per lane.
+    cell: what a C expression refers to: one number, or a row of numbers in a loop over lanes. An
+        array is a numpy array of cells; its axis of lanes is absent there, and all other axes are
+        unrolled, so that slicing or transposing an array costs no time on the robot.
+    memory: named storage in C: a struct field, an array on the stack or a table of constants.
+    source: array whose elements are rearranged into a new array.
+    place: index of an element in some sources, each flattened in row-major order, concatenated.
 """
 
 from __future__ import annotations
@@ -21,25 +26,25 @@ if TYPE_CHECKING:
     from slipid.exports.c99.builder import Builder
 
 Cells = np.ndarray
-"""Numpy array of objects, each of which is a `Cell`."""
+"""Numpy array (dtype object) of `Cell`s, as defined at the top of this file."""
 LOOP_FROM = 7
-"""Smallest length of an axis of an array that becomes a loop in C."""
+"""Smallest length of an axis that becomes a loop in C; shorter axes are unrolled."""
 
 
 class NoFormError(Exception):
-    """Reason why a use of a primitive cannot be converted to C."""
+    """Reason why a primitive cannot be turned into C with these arguments."""
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A constant number; constants compare by their text, so that 0.0 and -0.0 differ."""
+    """A constant number; equality compares `text`, so that 0.0 and -0.0 differ."""
 
     value: float | int | bool = field(compare=False)
     kind: Kind
     text: str = field(init=False)
 
     def __post_init__(self) -> None:
-        """Set the text by which constants compare."""
+        """Set `text` to the shortest decimal text of the value."""
         object.__setattr__(self, "text", repr(self.value))
 
 
@@ -49,13 +54,13 @@ class Memory:
 
     Attributes:
         name: name in C.
-        kind: kind of its numbers.
-        size: count of its numbers.
-        home: block that fills it; None if it is filled before the function begins.
+        kind: kind of the stored numbers.
+        size: count of the stored numbers.
+        home: block that writes the numbers; None if they are there before the function begins.
         values: bytes of a table of constants, empty for other memory.
         scalar: True if it is a single number that C accesses without an index.
-        lanes: True if it stores the lanes of a variable. Truth values are then stored as the
-            numbers 1 and 0, since compilers vectorize loops over numbers of one size.
+        lanes: True if it stores one number per lane of a variable. Truth values are then stored as
+            the numbers 1 and 0, since compilers vectorize loops over numbers of one size.
     """
 
     name: str
@@ -69,7 +74,10 @@ class Memory:
 
 @dataclass(frozen=True)
 class At:
-    """A number in memory: `memory[offset + stride * lane + index]`, or `memory[table[lane]]`."""
+    """The cell `memory[offset + stride * l + index]`, or `memory[table[l]]`; `l` is the lane.
+
+    `index` is an offset computed at run time, and `table` an integer array of constants.
+    """
 
     memory: Memory
     offset: int
@@ -85,14 +93,14 @@ class At:
 
 @dataclass(eq=False)
 class Variable:
-    """A number that a statement computes, or one number per lane if `lanes` is not 0.
+    """A local variable in C: the result of a statement, computed in every lane if `lanes` is not 0.
 
     Attributes:
         kind: kind of the number.
-        number: number that makes its name unique.
-        lanes: count of its lanes.
-        home: block that computes it.
-        made_by: template and cells of the statement that computes it.
+        number: serial number, from which the name in C is made.
+        lanes: number of lanes; 0 for a single number.
+        home: block of the statement that computes it.
+        made_by: template and cells of that statement.
     """
 
     kind: Kind
@@ -103,7 +111,7 @@ class Variable:
 
     @property
     def memory(self) -> Memory:
-        """Array on the stack that stores its lanes."""
+        """Stack array with one number per lane, for blocks other than `home`."""
         return Memory(f"m{self.number}", self.kind, self.lanes, self.home, lanes=True)
 
 
@@ -113,17 +121,17 @@ Cell = Constant | At | Variable
 
 @dataclass(eq=False)
 class Statement:
-    """The C statement `target = template`, with cells in the places {0}, {1} and so on.
+    """The C statement `target = template`, with cells for the placeholders {0}, {1} and so on.
 
     Attributes:
         target: variable that it computes; None if the template is a whole C statement.
-        template: C text with places for cells.
-        cells: cells for these places.
-        writes: memory that the template fills.
-        times: count of the numbers that it fills in a separate loop; 0 for no such loop.
-        always: True to keep it even if that memory is never read.
+        template: C text with placeholders for cells.
+        cells: cells for these placeholders.
+        writes: memory that the template writes to.
+        times: iterations of a loop around this statement alone; 0 for no such loop.
+        always: True if the statement is kept even if nothing reads the memory that it writes.
         start: initial value of a reduction; empty for other statements.
-        source: file and line of the Python code that it is generated from.
+        source: file and line of the Python code that the statement is generated from.
     """
 
     target: Variable | None
@@ -138,18 +146,18 @@ class Statement:
 
 @dataclass(eq=False)
 class CodeBlock:
-    """Statements that run one after the other, for every lane if `lanes` is not 0.
+    """Statements in sequence, within a loop over lanes if `lanes` is not 0.
 
-    A block with bodies is a condition or a repetition, and has no other statements.
+    A block with bodies is an if-else or a repetition instead, and has no statements of its own.
 
     Attributes:
-        owner: builder to which it belongs.
+        owner: builder that the block belongs to.
         lanes: number of iterations of the loop; 0 for straight-line code.
-        calls: True if its statements call functions.
-        when: condition under which the first of two bodies runs, else the second.
-        times: number of times that the one body of a repetition runs.
+        calls: True if the loop contains reductions or calls of C's library, see `CALLS`.
+        when: condition of an if-else: if true, the first of two bodies runs, else the second.
+        times: number of times that the single body of a repetition runs.
         bodies: builders of the bodies.
-        place: its index among the blocks of the owner.
+        place: index of the block among the blocks of the owner.
         statements: statements in order.
     """
 
@@ -171,7 +179,7 @@ class Array:
         shape: shape of the array.
         kind: kind of its numbers.
         axis: axis of the lanes; None without lanes.
-        cells: cells of the array, whose shape lacks that axis.
+        cells: cells, with the shape of the array less its axis of lanes.
     """
 
     shape: tuple[int, ...]
@@ -200,14 +208,14 @@ def axis_of(value: Value) -> int | None:
 
 
 def cells_of(shape: Sequence[int], cells: Sequence[Cell]) -> Cells:
-    """Return cells in row-major order as an array of this shape."""
+    """Return a list of cells, in row-major order, as a numpy array of this shape."""
     out = np.empty(len(cells), dtype=object)
     out[:] = cells
     return out.reshape(shape)
 
 
 def varies(cell: Cell) -> bool:
-    """Return whether a cell differs from lane to lane."""
+    """Return whether a cell has different values in different lanes."""
     if isinstance(cell, At):
         by_index = cell.index is not None and cell.index.lanes > 0
         return cell.stride != 0 or cell.table is not None or by_index
@@ -215,24 +223,24 @@ def varies(cell: Cell) -> bool:
 
 
 def longest(shape: Sequence[int]) -> int | None:
-    """Return the axis that becomes a loop by default, the longest; None if all are short."""
+    """Return the longest axis, which becomes a loop; None if shorter than `LOOP_FROM`."""
     if max(shape, default=0) < LOOP_FROM:
         return None
     return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
 
 
 def numbered(shape: Sequence[int]) -> np.ndarray:
-    """Return an array of this shape whose numbers are their row-major indices."""
+    """Return an array of this shape in which each element is its own row-major index."""
     return np.arange(prod(shape)).reshape(shape)
 
 
 def rows_of(values: np.ndarray, axis: int | None) -> np.ndarray:
-    """Return values with the axis of the lanes last; without lanes, a last axis of length 1."""
+    """Move the axis of the lanes to the end; without lanes, append an axis of length 1."""
     return values[..., None] if axis is None else np.moveaxis(values, axis, -1)
 
 
 def read_at(memory: Memory, places: np.ndarray, index: Variable | None = None) -> Array:
-    """Return the numbers at evenly spaced places of memory, all of them shifted by an index."""
+    """Return an array that reads memory at `places + index`; places are evenly spaced in a row."""
     axis = longest(places.shape)
     rows = rows_of(places, axis)
     cells = [
@@ -243,7 +251,7 @@ def read_at(memory: Memory, places: np.ndarray, index: Variable | None = None) -
 
 
 def in_memory(memory: Memory, shape: tuple[int, ...]) -> Array:
-    """Return the array of this shape that is stored in memory in row-major order."""
+    """Return memory as an array of this shape in row-major order."""
     return read_at(memory, numbered(shape))
 
 

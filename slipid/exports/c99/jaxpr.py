@@ -17,11 +17,11 @@ from jax.extend.core import Jaxpr, JaxprEqn
 from slipid.support.errors import DataError
 
 KNOWN = ">=0.10,<0.13"
-"""Versions of JAX whose traced functions are supported."""
+"""Supported versions of JAX."""
 
 
 class Params(dict[str, Any]):
-    """Parameters of a primitive by their names in JAX.
+    """Parameters of a primitive, keyed by their names in JAX.
 
     Raises:
         DataError: in this version of JAX the primitive has no parameter of that name.
@@ -68,9 +68,9 @@ class ScanParameters:
 
     Attributes:
         body: the function.
-        turns: number of iterations.
-        constants: number of leading arguments that are the same in every iteration.
-        carried: number of the arguments after these, which are results of the last iteration.
+        turns: number of times that the function is applied.
+        constants: number of leading arguments, which are the same in every iteration.
+        carried: number of further arguments, which are the results of the previous iteration.
     """
 
     body: Traced
@@ -80,7 +80,7 @@ class ScanParameters:
 
     @classmethod
     def of(cls, params: Params) -> ScanParameters:
-        """Return the parameters from the numbers of JAX 0.10 or the trees of later versions.
+        """Read the parameters in the form of JAX 0.10 (two counts) or of later versions (a tree).
 
         Raises:
             DataError: this version of JAX represents them in an unsupported way.
@@ -101,7 +101,7 @@ def called(params: Params) -> Traced:
 
 
 def branches(params: Params) -> list[Traced]:
-    """Return the functions among which a condition selects one to call."""
+    """Return the functions of the branches of a `cond`."""
     return [Traced.of(branch) for branch in params["branches"]]
 
 
@@ -117,7 +117,7 @@ def source_line(equation: JaxprEqn) -> str:
 
 
 def unknown(what: str) -> DataError:
-    """Return the error for a version of JAX that represents something in an unsupported way."""
+    """Return the error that this version of JAX represents something in an unsupported way."""
     return DataError(
         f"jax {jax.__version__} represents {what} in a way that this version of slipid does not "
         f"support; expected a supported version: pip install 'jax{KNOWN}'"

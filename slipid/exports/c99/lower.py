@@ -1,4 +1,7 @@
-"""Lowering of traced functions to C statements; constant expressions are computed at export."""
+"""Lowering of traced functions to C statements; constant expressions are computed at export.
+
+The words lane, row, cell, source and place are defined in `slipid.exports.c99.ir`.
+"""
 
 from __future__ import annotations
 
@@ -51,15 +54,15 @@ RULES: dict[str, Rule] = {
     "scatter-mul": moves.scattered("mul", 1.0),
     "select_n": arithmetic.select,
 }
-"""Rules for the conversion of primitives to C, by the name of the primitive.
+"""Rules that turn a primitive of JAX into C, keyed by the primitive's name.
 
-Primitives that only move numbers need no separate rule: they are applied to the indices of the
-numbers, which gives the sources of the numbers in their result."""
+Primitives in `MOVES`, which only move numbers, have no rule here: they are applied at export to the
+indices of the elements, which shows where each element of the result comes from."""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
-"""Primitives that call a function; its statements are inlined."""
+"""Primitives that call another traced function, whose statements are inlined."""
 
 _TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
-"""Types of numbers that have a counterpart in C."""
+"""Data types that the generated C code supports."""
 
 
 class UnsupportedError(DataError):
@@ -70,7 +73,7 @@ class UnsupportedError(DataError):
 
 
 def lowered(builder: Builder, traced: Traced, values: Sequence[Value]) -> list[Value]:
-    """Return the results of a traced function for these inputs; its statements go to `builder`.
+    """Append the statements of a traced function to a builder, and return the function's results.
 
     Raises:
         UnsupportedError: the function uses a primitive without a rule.
@@ -130,7 +133,7 @@ def _ruled(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Va
 
 
 def _cond(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
-    """Return the results of a conditional call of one of two functions."""
+    """Append an if-else with a function in each branch, and return the results."""
     which, choices = values[0], branches(params)
     if len(choices) != 2:
         raise NoFormError("more than two branches")
@@ -152,12 +155,12 @@ def _cond(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
 
 
 def _memory(builder: Builder, like: Value, block: CodeBlock) -> Memory:
-    """Return new memory for a value, which a block fills."""
+    """Return new memory of the kind and size of a value, written in a block."""
     return Memory(f"m{builder.names.number()}", kind_of_value(like), prod(like.shape), block)
 
 
 def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
-    """Return the results of a function applied to its own result a fixed number of times."""
+    """Append a loop that applies a function repeatedly to its own result; return the result."""
     scan = ScanParameters.of(params)
     carried, consts = scan.carried, scan.constants
     if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
@@ -179,9 +182,9 @@ def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
 
 
 def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
-    """Return a result, with cells in memory that will be overwritten copied to variables.
+    """Copy those cells of a result to variables that lie in memory about to be overwritten.
 
-    `overwritten` are the names of that memory.
+    `overwritten` has the names of that memory.
     """
     if not isinstance(value, Array):
         return value
@@ -196,7 +199,7 @@ def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
 
 
 def store(builder: Builder, value: Value, memory: Memory) -> None:
-    """Write an array, in row-major order, into memory at the end of a builder's code."""
+    """Append statements that write an array into memory in row-major order."""
     shape = value.shape
     axis = value.axis if isinstance(value, Array) else longest(shape)
     cells = along(builder, value, shape, axis)
@@ -219,7 +222,7 @@ def _place(memory: Memory, offset: int, stride: int) -> str:
 
 
 def _filled(value: Value) -> Value:
-    """Return the value itself, or a constant array if it has no elements."""
+    """Return a value unchanged, but one without elements as a numpy array."""
     return value if prod(value.shape) else np.zeros(value.shape, DTYPES[kind_of_value(value)])
 
 

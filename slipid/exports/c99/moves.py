@@ -33,16 +33,17 @@ MOVES = frozenset(
         *("reshape", "rev", "slice", "split", "squeeze", "stack", "transpose", "unstack"),
     }
 )
-"""Primitives that only move numbers, provided that their indices are constant."""
+"""Primitives that only rearrange the elements of arrays, if all their indices are constant."""
 SOURCES = {"gather": 1, "dynamic_slice": 1}
-"""Number of leading arguments whose numbers a primitive moves; the others are indices. Primitives
-that are not listed move all arguments."""
+"""Number of leading arguments that a primitive rearranges; its other arguments are indices. The
+primitives that are not listed rearrange all arguments."""
 
 
 def moved(primitive: Primitive, sources: int) -> Rule:
-    """Return the rule of a primitive that moves numbers of its first `sources` arguments.
+    """Return the rule of a primitive that rearranges the elements of its first `sources` arguments.
 
-    The other arguments, the indices, must be constant; with 0 `sources` all arguments are moved.
+    The other arguments, the indices, must be constant. If `sources` is 0, all arguments are
+    rearranged.
     """
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -56,16 +57,16 @@ def moved(primitive: Primitive, sources: int) -> Rule:
 
 
 def scatter(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return an array with some numbers replaced at constant indices."""
+    """Return an array with some elements replaced, at constant indices."""
     old, where, new = values
     places = _scattered(numbered(old.shape), where, new.shape, params, prod(old.shape))
     return rearranged(builder, [old, new], places)
 
 
 def scattered(name: str, neutral: float) -> Rule:
-    """Return the rule of a primitive that adds to or multiplies numbers at constant indices.
+    """Return the rule of a primitive that adds to, or multiplies, elements at constant indices.
 
-    Each index may occur only once. `neutral` is the neutral number of the operation.
+    Each index may occur only once. `neutral` is the neutral element of the operation.
     """
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -81,23 +82,23 @@ def scattered(name: str, neutral: float) -> Rule:
 def _scattered(
     old: np.ndarray, where: Value, shape: tuple[int, ...], params: Params, fresh: int
 ) -> np.ndarray:
-    """Return `old` with the indices of the new numbers, counted from `fresh`, put in their places.
+    """Return `old` with the entries at the indices `where` replaced by `fresh`, `fresh` + 1, ...
 
-    `where` are the places to replace, and `shape` is the shape of the new numbers.
+    These are the places of the new elements, whose array has the shape `shape`.
     """
     if isinstance(where, Array):
-        raise NoFormError("places that are not known before the robot runs")
+        raise NoFormError("indices that are not constant")
     kept = {k: params[k] for k in ("dimension_numbers", "indices_are_sorted", "mode")}
     new = fresh + numbered(shape)
     options = {**kept, "unique_indices": False}
     times = lax.scatter_add(np.zeros(old.shape, int), where, np.ones(shape, int), **options)
     if np.max(times, initial=0) > 1:
-        raise NoFormError("a place that is written twice")
+        raise NoFormError("an index that occurs twice")
     return np.asarray(lax.scatter(old, where, new, **options))
 
 
 def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return a part of an array that begins at an index computed at run time."""
+    """Return the part of an array that begins at indices computed at run time."""
     whole, starts, sizes = values[0], values[1:], params["slice_sizes"]
     memory = contiguous(builder, whole)
     base = _offset(builder, [along(builder, s, (), None).item() for s in starts], whole, sizes)
@@ -108,9 +109,10 @@ def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Sh
 def _offset(
     builder: Builder, starts: Sequence[Cell], whole: Value, sizes: Sequence[int], lanes: int = 0
 ) -> Variable:
-    """Return the flat index of the first number of a part of an array, limited to its bounds.
+    """Return the row-major index of the first element of a part of an array.
 
-    It has lanes if any start index differs from lane to lane.
+    The part is shifted into the array if it exceeds a bound. The index has lanes if any start index
+    has different values in different lanes.
     """
     terms, cells = [], []
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
@@ -122,13 +124,13 @@ def _offset(
 
 
 def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return parts of an array at indices computed at run time, limited to its bounds."""
+    """Return parts of an array at indices computed at run time, clipped to the array's bounds."""
     whole, where = values
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
-        raise NoFormError("batches of places")
+        raise NoFormError("batches of indices")
     if params["mode"] == lax.GatherScatterMode.FILL_OR_DROP:
-        raise NoFormError("places out of range that are filled")
+        raise NoFormError("indices out of range that give a fill value")
     memory = contiguous(builder, whole)
     batch = [d for d in range(len(out.shape)) if d not in numbers.offset_dims]
     kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]

@@ -1,4 +1,7 @@
-"""Arrays of cells: access to single numbers, rearrangement, and conversion to common lanes."""
+"""Arrays of cells: access to single elements, rearrangement, and change of the axis of lanes.
+
+The words lane, row, cell, source and place are defined in `slipid.exports.c99.ir`.
+"""
 
 from __future__ import annotations
 
@@ -30,11 +33,11 @@ from slipid.exports.c99.ir import (
 from slipid.exports.fields import kind_of
 
 MOST_UNROLLED = 64
-"""Largest count of numbers in an array without lanes that stays unrolled in C."""
+"""Largest number of elements of an array that is still unrolled in C."""
 
 
 class Sources:
-    """Numbers of some arrays, flattened and joined; a place is an index into all of them.
+    """Elements of some arrays, flattened and concatenated; a place is an index into all of them.
 
     Attributes:
         kind: kind of the numbers.
@@ -60,28 +63,31 @@ class Sources:
         return source.cells[tuple(at)], lane
 
     def best_axis(self, places: np.ndarray) -> int | None:
-        """Return the axis along which most rows are already lanes of a source.
+        """Return the best axis of lanes for an array whose elements come from these places.
 
-        Without such an axis it is the longest axis of a large result, and None for a small one.
+        It is the axis along which most rows are a cell of a source already, if at least half of all
+        elements are in such rows. Otherwise it is the longest axis, or None if the result is to be
+        unrolled: at most `MOST_UNROLLED` different elements, all axes shorter than 2 `LOOP_FROM`.
         """
-        free = {axis: self._free(places, axis) for axis in range(places.ndim)}
-        axis = max(free, key=lambda a: (free[a], places.shape[a], a), default=None)
-        if axis is not None and 2 * free[axis] * places.shape[axis] >= places.size > 0:
+        ready = {axis: self._ready_rows(places, axis) for axis in range(places.ndim)}
+        axis = max(ready, key=lambda a: (ready[a], places.shape[a], a), default=None)
+        if axis is not None and 2 * ready[axis] * places.shape[axis] >= places.size > 0:
             return axis
         large = (
             len(np.unique(places)) > MOST_UNROLLED or max(places.shape, default=0) >= 2 * LOOP_FROM
         )
         return longest(places.shape) if large else None
 
-    def _free(self, places: np.ndarray, axis: int) -> int:
+    def _ready_rows(self, places: np.ndarray, axis: int) -> int:
+        """Return how many rows along an axis are a cell of a source already."""
         rows = np.moveaxis(places, axis, -1)
         if rows.shape[-1] < 2:
             return 0
         flat = rows.reshape(-1, rows.shape[-1])
-        return sum(self._lanes(row) is not None for row in flat)
+        return sum(self._ready_cell(row) is not None for row in flat)
 
-    def _lanes(self, row: np.ndarray) -> Cell | None:
-        """Return the cell of a source whose lanes are exactly this row, or None."""
+    def _ready_cell(self, row: np.ndarray) -> Cell | None:
+        """Return the cell of a source whose lanes are exactly these places, or None."""
         source, _ = self._source(int(row[0]))
         if not isinstance(source, Array) or source.axis is None or source.lanes != len(row):
             return None
@@ -90,7 +96,7 @@ class Sources:
         return cell if lane == 0 and np.array_equal(row, whole) else None
 
     def one(self, place: int) -> Cell:
-        """Return the cell of the number at a place."""
+        """Return the cell of the single element at a place."""
         if place not in self._ones:
             self._ones[place] = self._one(place)
         return self._ones[place]
@@ -107,10 +113,10 @@ class Sources:
         return At(cell.memory, cell.offset + cell.stride * lane, index=cell.index)
 
     def row(self, row: np.ndarray) -> Cell:
-        """Return the cell whose lanes are the numbers at these places."""
-        lanes = self._lanes(row)
-        if lanes is not None:
-            return lanes
+        """Return the cell whose lanes are the elements at these places."""
+        ready = self._ready_cell(row)
+        if ready is not None:
+            return ready
         cells = [self.one(int(place)) for place in row]
         if all(cell == cells[0] for cell in cells):
             return cells[0]
@@ -134,13 +140,13 @@ class Sources:
         return At(first.memory, 0, table=self._builder.names.table(places, "int"))
 
     def _laned_source(self, row: np.ndarray) -> Value | None:
-        """Return the array with lanes that all numbers of a row come from; None without one."""
+        """Return the array with lanes that all elements of a row come from; None without one."""
         source, *others = (self._source(int(place))[0] for place in row)
         same = all(other is source for other in others)
         return source if same and axis_of(source) is not None else None
 
     def copied(self, places: np.ndarray) -> Memory:
-        """Return memory that holds these numbers contiguously; a copy is made only if needed."""
+        """Return memory that contains exactly these elements in order, copied only if needed."""
         cells = [self.one(int(place)) for place in places]
         offsets = _places(cells)
         first = cells[0]
@@ -156,7 +162,7 @@ class Sources:
         return memory
 
     def _copy(self, memory: Memory, start: int, group: list[Cell]) -> None:
-        """Fill memory from index `start` on with a group of evenly spaced numbers, or with one."""
+        """Copy a group of evenly spaced elements, or one element, to memory from index `start`."""
         first, *rest = group
         if not rest:
             self._builder.fill(memory, f"{{memory}}[{start}] = {{0}};", first)
@@ -169,7 +175,7 @@ class Sources:
 
 
 def contiguous(builder: Builder, value: Value) -> Memory:
-    """Return memory that holds an array in row-major order."""
+    """Store an array in row-major order, unless it is stored so already; return the memory."""
     if not isinstance(value, Array):
         return builder.names.table(value, kind_of(value.dtype))
     key = id(value.cells)
@@ -193,7 +199,7 @@ def _contiguous(builder: Builder, value: Array) -> Memory:
 
 
 def _places(cells: Sequence[Cell]) -> np.ndarray | None:
-    """Return the offsets of cells in their common memory; None if they have none."""
+    """Return the offsets of cells in memory; None unless all are in the same memory."""
     first = cells[0]
     for cell in cells:
         if not isinstance(cell, At) or not isinstance(first, At):
@@ -204,9 +210,9 @@ def _places(cells: Sequence[Cell]) -> np.ndarray | None:
 
 
 def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
-    """Return cells in their order, in groups of three or more evenly spaced ones in one memory.
+    """Divide cells, in order, into groups that one loop can copy.
 
-    All other cells form groups of one.
+    A group is three or more evenly spaced cells of the same memory, or a single cell.
     """
     runs: list[list[Cell]] = []
     for cell in cells:
@@ -221,13 +227,14 @@ def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
 def rearranged(
     builder: Builder, sources: Sequence[Value], places: np.ndarray, axis: int | None = -1
 ) -> Value:
-    """Return the array whose numbers are at these places of the sources, flattened and joined.
+    """Return the array whose elements are at these places of the sources.
 
     Args:
         builder: builder of the code.
-        sources: arrays that the numbers come from.
-        places: place of every number of the result in the joined sources.
-        axis: axis of the result's lanes, None for no lanes; by default (-1) the cheapest one.
+        sources: arrays that the elements come from.
+        places: for every element of the result, its index in the sources, which are flattened and
+            concatenated.
+        axis: axis of the result's lanes, None for no lanes; by default (-1) as `Sources.best_axis`.
     """
     constants = [np.ravel(s) for s in sources if not isinstance(s, Array)]
     if len(constants) == len(sources):
@@ -242,7 +249,7 @@ def rearranged(
 
 
 def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | None) -> Cells:
-    """Return the cells of a value broadcast to a shape, with lanes along an axis."""
+    """Broadcast a value to a shape, make `axis` the axis of its lanes, and return its cells."""
     if not isinstance(value, Array):
         rows = rows_of(np.broadcast_to(value, shape), axis)
         cells = [_row_of_constants(builder, row) for row in rows.reshape(-1, rows.shape[-1])]
@@ -255,7 +262,7 @@ def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | No
 
 
 def _row_of_constants(builder: Builder, row: np.ndarray) -> Cell:
-    """Return a row of constants as a cell: a table, or one constant if all are equal."""
+    """Return the cell of a row of constants: a table, or a single constant if all are equal."""
     kind = kind_of(row.dtype)
     if row.tobytes() == len(row) * row[:1].tobytes():
         return Constant(row[0].item(), kind)

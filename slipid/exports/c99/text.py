@@ -1,4 +1,4 @@
-"""Conversion of statements to C99 text, without unused statements and with shared arrays."""
+"""Conversion of statements to C99 text: unused statements are omitted, stack arrays are shared."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from slipid.exports.fields import DTYPES, Kind
 
 
 class Usage:
-    """Record of which statements and arrays of a builder are used, and when.
+    """Liveness analysis: which statements and arrays of a builder are used, and when.
 
-    It is determined backwards from the end, since a statement is needed if a later one uses its
-    result; steps are numbered downwards, so that earlier ones have smaller numbers.
+    The code is scanned backwards from its end, since a statement is needed if a later one uses its
+    result. Steps are therefore counted downwards, so that an earlier step has a smaller number.
 
     Attributes:
-        live: identities of the statements that are needed.
+        live: `id` of each statement that is needed.
         read: names of all memory that is read.
-        shared: array on the stack for each memory, by the memory's name.
+        shared: array on the stack for each memory, keyed by the memory's name.
     """
 
     def __init__(self, builder: Builder):
@@ -37,7 +37,7 @@ class Usage:
         self.shared = _shared(list(self._lives.values()))
 
     def _scan(self, builder: Builder) -> None:
-        """Mark the statements and arrays that are used, from the end to the beginning."""
+        """Mark the needed statements and their arrays, from the last statement to the first."""
         for block in reversed(builder.blocks):
             self._step -= 1
             if block.bodies:
@@ -60,7 +60,7 @@ class Usage:
             self._uses(cell, block)
 
     def _inside(self, nested: CodeBlock) -> None:
-        """Mark what the bodies use; memory filled before a repetition stays live until its end."""
+        """Mark what the bodies use; memory written before a repetition stays live until its end."""
         end = self._step
         for body in nested.bodies:
             self._scan(body)
@@ -116,7 +116,7 @@ def _within(memory: Memory, nested: CodeBlock) -> bool:
 
 
 class StackArray(NamedTuple):
-    """An array on the stack: kind and name in C, and count of its numbers."""
+    """An array on the stack: kind of its numbers, name in C, and length."""
 
     kind: Kind
     name: str
@@ -124,9 +124,9 @@ class StackArray(NamedTuple):
 
 
 def _shared(arrays: list[_Life]) -> dict[str, StackArray]:
-    """Return the stack array for each memory, by the memory's name.
+    """Return the stack array for each memory, keyed by the memory's name.
 
-    Memories of one kind and size that are not in use at the same time share an array.
+    Two memories share an array if they have the same kind and size and are never in use at once.
     """
     slots: dict[tuple[Kind, int], list[_Life]] = {}
     shared: dict[str, StackArray] = {}
@@ -182,7 +182,7 @@ class FunctionBody:
     Attributes:
         lines: lines of declarations and statements.
         reads: names of all memory that the code reads.
-        scratch: count of the numbers in its arrays on the stack.
+        scratch: total size of its arrays on the stack, counted in numbers.
     """
 
     def __init__(self, builder: Builder):
@@ -241,7 +241,7 @@ class FunctionBody:
         return lines
 
     def _write(self, statement: Statement, cells: list[str], indent: str) -> list[str]:
-        """Return a statement that fills memory, in a loop if it fills several numbers."""
+        """Return the C text of a statement that writes to memory, in a loop if it has one."""
         assert statement.writes is not None
         text = statement.template.format(*cells, memory=self._name(statement.writes))
         if statement.times:
@@ -250,7 +250,7 @@ class FunctionBody:
         return [f"{indent}{text}"]
 
     def _where(self, statement: Statement, indent: str) -> list[str]:
-        """Return a comment with the Python line of a statement, if it differs from the last one."""
+        """Return a comment with the Python line of a statement if it differs from the last one."""
         if statement.source == self._source:
             return []
         self._source = statement.source
@@ -274,12 +274,12 @@ class FunctionBody:
         return self._number(cell.memory, " + ".join(terms))
 
     def _number(self, memory: Memory, place: str) -> str:
-        """Return the C expression of a number in memory; `place` is the text of its index."""
+        """Return the C expression `memory[place]`; `place` is the text of the index."""
         text = f"{self._name(memory)}[{place}]"
         return f"({text} != R(0.0))" if memory.lanes and memory.kind == "bool" else text
 
     def _name(self, memory: Memory) -> str:
-        """Return the name of memory in C: that of its shared stack array, or else its own."""
+        """Return the C name of memory: the name of its stack array if it has one, else its own."""
         shared = self._usage.shared.get(memory.name)
         return memory.name if shared is None else shared.name
 

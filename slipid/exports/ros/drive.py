@@ -25,7 +25,7 @@ from slipid.robot.deployed import DeployedRobot
 LARGEST_DIFFERENCE = 0.05
 """Largest difference of kinematics with which a controller is used for a robot.
 
-It is the error of a rim speed as a share of the body's speed [1], the speed is that of points on
+It is the error of a rim speed as a fraction of the body's speed [1], the speed is that of points on
 the base radius if the body turns on the spot."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
@@ -39,7 +39,7 @@ class DriveController:
         odometry: topic of its odometry, relative to the controller's name.
         covariances: parameters with the diagonals of the covariances of pose and twist.
         wheels: numbers of the robot's wheels in the controller's order.
-        turned: for each of these, True if the controller uses the opposite sign of the speed.
+        turned: for each of these wheels, whether its speed has the opposite sign in the controller.
         parameters: parameters of the controller.
         difference: largest difference of the controller's kinematics from the robot's, as in
             `LARGEST_DIFFERENCE` [1].
@@ -74,9 +74,10 @@ def joint(wheel: int) -> str:
 def _with_signs(
     robot: DeployedRobot, order: Int[np.ndarray, " wheel"], axis: int, sign: float
 ) -> tuple[Float[np.ndarray, "wheel 3"], tuple[bool, ...]]:
-    """Return rows of the robot's kinematics J in a controller's order, with its signs.
+    """Return the rows of the robot's kinematics J in a controller's order and sign convention.
 
-    Signs are such that column `axis` has `sign`; the second result marks those that were changed.
+    Rows are negated where needed so that column `axis` has the sign `sign`; the second result is
+    True for each negated row.
     """
     rows = np.asarray(robot.forward)[order]
     turned = rows[:, axis] * sign < 0
@@ -84,7 +85,7 @@ def _with_signs(
 
 
 def _difference(robot: DeployedRobot, kinematics: Float[np.ndarray, "wheel 3"]) -> float:
-    """Return the largest entry of a difference of kinematics, see `LARGEST_DIFFERENCE` [1]."""
+    """Return the rim speed error of a difference of kinematics, as `LARGEST_DIFFERENCE` [1]."""
     scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
     return float(np.abs(kinematics * scale).max())
 
@@ -98,7 +99,7 @@ def _omni(robot: DeployedRobot) -> DriveController | None:
     if count < 3:
         return None
     azimuth = np.arctan2(places[:, 1], places[:, 0])
-    # A wheel whose azimuth is below that of the first one by a rounding error is taken to be at 0.
+    # 1e-6: an azimuth a rounding error below that of the first wheel must not wrap to 2 pi
     order = np.argsort(np.mod(azimuth - azimuth[0] + 1e-6, 2 * np.pi))
     rows, turned = _with_signs(robot, order, axis=2, sign=-1.0)
     even = 2 * np.pi * np.arange(count) / count

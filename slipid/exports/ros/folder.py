@@ -48,7 +48,7 @@ USES: Mapping[str, str] = {
     "slipid_parameters.yaml": "declaration of these parameters for generate_parameter_library: "
     "types, descriptions with verdicts, and validators; the defaults are the identified numbers",
 }
-"""Use of each file, by name, without the files for single floors."""
+"""Use of each file, keyed by name, without the files for single floors."""
 _FLOOR = (
     "covariances of the drive controller and process noise of `robot_localization.yaml` on this "
     "floor: load it after those files, whose values it overrides"

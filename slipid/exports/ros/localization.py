@@ -62,7 +62,7 @@ class OdometryErrors:
     slip: Axes
 
     @property
-    def stays(self) -> Axes:
+    def constant(self) -> Axes:
         """Std of the constant error per metre of path, effect and slip together [m/m, rad/m]."""
         return axes_of(np.hypot(self.effect, self.slip))
 
@@ -72,7 +72,7 @@ class OdometryErrors:
 
     def pose(self, distance: float) -> Axes:
         """Return the variances of x, y and heading [m^2, m^2, rad^2] after a path length [m]."""
-        e, q = np.asarray(self.stays), np.asarray(self.process)
+        e, q = np.asarray(self.constant), np.asarray(self.process)
         along, across, yaw = (e * distance) ** 2 + q**2 * distance
         across += (e[2] * distance**2 / 2) ** 2 + q[2] ** 2 * distance**3 / 3
         place = max(along, across)
@@ -83,7 +83,7 @@ class OdometryErrors:
 
         They are (e v)^2 + q^2 v / period at the speed v [m/s].
         """
-        e, q = np.asarray(self.stays), np.asarray(self.process)
+        e, q = np.asarray(self.constant), np.asarray(self.process)
         return _level((e * speed) ** 2 + q**2 * speed / period)
 
     def walk(self, speed: float, distance: float) -> Axes:
@@ -92,7 +92,7 @@ class OdometryErrors:
         After the path length d [m] at the speed v [m/s] its std equals the constant error e d, so
         the variance per second is e^2 d v.
         """
-        return _level(np.asarray(self.stays) ** 2 * distance * speed)
+        return _level(np.asarray(self.constant) ** 2 * distance * speed)
 
 
 def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
@@ -138,7 +138,7 @@ def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"
 
 
 def _level(row: Float[np.ndarray, "3"]) -> Axes:
-    """Return the variances with the larger one of along and across in both places."""
+    """Replace the variances along and across by the larger of the two."""
     return axes_of(np.array([row[:2].max(), row[:2].max(), row[2]]))
 
 

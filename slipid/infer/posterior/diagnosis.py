@@ -132,11 +132,11 @@ class Posterior:
         Raises:
             ValueError: the picture does not exist.
         """
-        from slipid.plots.posterior import PICTURES
+        from slipid.plots.posterior import FIGURES
 
-        if name not in PICTURES:
-            raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
-        return PICTURES[name](self)
+        if name not in FIGURES:
+            raise ValueError(f"no figure '{name}'; there are {', '.join(FIGURES)}")
+        return FIGURES[name](self)
 
     def deploy(self) -> "DeployedRobot":
         """Return the model for the robot, with the intervals of the draws.

@@ -27,7 +27,7 @@ from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.benchmark/1"
 Tables = dict[str, dict[str, dict[str, RowSummary]]]
-"""Row summaries, by name of the data set, then of the protocol, then of the row."""
+"""Row summaries, keyed by name of the data set, then of the protocol, then of the row."""
 BenchmarkTask = FoldTask | FloorTask | RectangleTask
 """A part of the benchmark's work that saves its results in a checkpoint."""
 

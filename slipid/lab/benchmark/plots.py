@@ -15,7 +15,7 @@ OWN_PREFIX = "slipid"
 
 
 def benchmark_pictures(found: Content) -> dict[str, bytes]:
-    """Return a PNG file as bytes for every data set of benchmark.json, by the data set's name."""
+    """Draw a figure for every data set of benchmark.json; return PNG bytes, keyed by its name."""
     made = {n: benchmark_figure(one, found["protocols"], n) for n, one in found["sets"].items()}
     return {name: drawing.png(figure) for name, figure in made.items() if figure is not None}
 
@@ -27,7 +27,7 @@ def benchmark_figure(one: Content, about: Content, name: str) -> Figure | None:
 
     Args:
         one: content of a data set in benchmark.json.
-        about: descriptions of the protocols, by name.
+        about: descriptions of the protocols, keyed by name.
         name: name of the data set.
     """
     protocols = {

@@ -67,9 +67,9 @@ def methods(
     """Return head and body of the table of methods, sorted by end-point error, the smallest first.
 
     Args:
-        rows: rows of a protocol; those without results are left out.
-        numbers: fields of `COLUMNS` that the table has.
-        costs: last ones of `COSTS`, which the table has as well.
+        rows: rows of a protocol; those without results are omitted.
+        numbers: fields of `COLUMNS` that become columns.
+        costs: trailing entries of `COSTS` that become columns after these.
     """
     there = [(name, one) for name, one in rows.items() if one["endpoint_error"] is not None]
     body = [

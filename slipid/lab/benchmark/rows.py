@@ -16,9 +16,9 @@ KINEMATIC = ("effective_track", "instantaneous_centres")
 
 
 def _every() -> list[SlipModel]:
-    """Return all methods, unfitted.
+    """Return all methods before their fit.
 
-    Methods that do not distinguish floors are wrapped, so that they are fitted floor by floor.
+    Methods that do not handle floors themselves are wrapped in a model that fits them per floor.
     """
     of_one_floor: list[SlipModel] = [
         *(Corrected(name) for name in KINEMATIC),

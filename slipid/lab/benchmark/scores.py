@@ -26,7 +26,7 @@ SLIP_THRESHOLD = 0.2
 """Difference of the body's twist from that of the rolling wheels, relative to the latter, above
 which a window counts as slipping."""
 REST_SPEED = 0.02
-"""Norm of the rolling wheels' twist [m/s] up to which a window is not used for slip detection."""
+"""Largest norm of the rolling wheels' twist of windows not used for slip detection [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class RunScore:
         covered90: True if the true end lies in the predicted 90 % region; None without a region.
         scores: slip score of each moving window; higher if the method predicts more slip.
         slips: True for each moving window in which the robot slips.
-        floor_right: share of the time in which the most probable floor is the true one; None for
+        floor_right: fraction of the time in which the most probable floor is the true one; None for
             methods without floor probabilities.
         energy_error: relative error of the run's electric energy; None if it is not predicted.
     """
@@ -89,7 +89,7 @@ def scored(run: Run, predicted: PredictedRun, spec: RobotSpec, over: Over) -> Ru
 
 
 def _length(path: Float[np.ndarray, "edge 3"], over: Over) -> float:
-    """Return the chord or the path length of a path, selected by `over` [m]."""
+    """Return the chord or the path length of a path, according to `over` [m]."""
     return (chords if over == "chord" else lengths)(path[None])[0]
 
 

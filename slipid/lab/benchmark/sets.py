@@ -140,7 +140,7 @@ class DataSet:
         logged = self.logged.subset(keep)
         facts = tuple(self.facts[k] for k in keep)
         return replace(
-            self, job=_job(self.job.config, logged, self.source), logged=logged, facts=facts
+            self, job=_fit_job(self.job.config, logged, self.source), logged=logged, facts=facts
         )
 
     @property
@@ -175,7 +175,7 @@ def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> Data
             for part in ("fit", "unseen")
         ]
     logged, _ = read_dataset(_with_currents(config, source), sections, root, report)
-    job = _job(config, logged, source)
+    job = _fit_job(config, logged, source)
     facts = facts_of(logged, float(job.robot.geometry.base_radius))
     crossing, floor = None, None
     if source.crossing is not None and any(root.glob(source.crossing[0])):
@@ -203,8 +203,8 @@ def _with_currents(config: Config, source: LogSource) -> Config:
     return replace(config, content=config.content.model_copy(update={"layouts": layouts}))
 
 
-def _job(config: Config, logged: Runs, source: LogSource) -> ConfigFitTask:
-    """Return the task of slipid's fit to runs, with currents only if its config reads them."""
+def _fit_job(config: Config, logged: Runs, source: LogSource) -> ConfigFitTask:
+    """Return slipid's fit task for runs, without currents that only published methods use."""
     fitted = logged
     if source.currents:
         logs = [replace(log, current=None, current_fresh=None) for log in logged.logs]

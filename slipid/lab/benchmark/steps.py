@@ -29,7 +29,7 @@ class RunBatch:
 
     Attributes:
         numbers: index of each run in its data set.
-        runs: the runs; their signals, which methods are given, do not contain the floor.
+        runs: the runs; their signals, which methods are given, do not name the floor.
         windows: windows of the same runs; the last segments may be repeated as padding.
     """
 

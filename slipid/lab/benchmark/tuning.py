@@ -46,12 +46,12 @@ def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) ->
     """Return the method with the best of its settings, unfitted.
 
     With each setting, the method is fitted without a part of the runs and scored on that part. The
-    part is chosen by the protocol's kind of split if the training runs allow it. The score is the
-    mean error of the end point relative to the path length, or of the energy, depending on
-    `SlipModel.aim`; all floors have the same weight. A setting with which the method cannot be
-    fitted has the worst score. All training runs are used, since the best settings for fewer runs
-    would be too cautious. For a method that is fitted floor by floor, one fit to all runs together
-    is also tried, with the best settings, and used if it has the smaller loss.
+    part is chosen by the protocol's kind of split where the training runs allow it. The score is
+    the mean error, averaged with equal weights of floors: that of the end point relative to the
+    path length or that of the energy, see `SlipModel.aim`. A setting with which the method
+    cannot be fitted has the worst score. All training runs are used, since settings that are best
+    for fewer runs are too cautious. For a method that is fitted floor by floor, one fit to all runs
+    together is also tried, with the best settings, and used if it has the smaller loss.
     """
     part = inner(runs, kind)
 

@@ -88,7 +88,7 @@ class FoldTask:
         missing = [key for key, one in found.items() if one is None or one["failed"]]
         if missing:
             try:
-                data: FoldData | FoldScore[RunScore] = _fold_data(self)
+                data: FoldData | FoldScore[RunScore] = fold_data(self)
             except Exception as error:  # a task that fails does not stop the others
                 data = FoldScore.of_error(error)
             for protocol, name in missing:
@@ -97,7 +97,7 @@ class FoldTask:
         return self.name
 
     def rows(self) -> dict[tuple[str, str], FoldScore[RunScore]]:
-        """Return the scores in the checkpoint, by protocol and row."""
+        """Return the scores in the checkpoint, keyed by protocol and row."""
         kept = checkpoint_of(self, fit=False)
         found = {key: kept.load_json("_".join(key)) for key in keys_of(self)}
         return {key: FoldScore.of_json(one) for key, one in found.items() if one is not None}
@@ -159,7 +159,7 @@ class FoldData:
     Attributes:
         data: the data set.
         fit: slipid's fit, or an empty score with the reason why there is none.
-        training: training runs, whose signals contain the floor.
+        training: training runs, whose signals name the floor.
         batches: held-out runs, in batches with equal numbers of steps.
         held_out: logs of the held-out runs.
     """
@@ -176,7 +176,7 @@ class FoldData:
         return [run for batch in self.batches for run in batch.runs]
 
 
-def _fold_data(task: FoldTask) -> FoldData:
+def fold_data(task: FoldTask) -> FoldData:
     """Return the runs and slipid's fit of a fold.
 
     Poses are corrected by the camera model that slipid fitted to the training runs, or by that of

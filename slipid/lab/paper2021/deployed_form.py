@@ -13,7 +13,7 @@ xi is the twist of the body, `back` the matrix from wheel rim speeds to the twis
 radius [m], w_i the speed [rad/s] and s_i the slip of wheel i. M is the torque characterising
 variable at the motor's shaft [N m], I~ the current [A] after exponential smoothing, which keeps
 0.97 of its value from one sample of 31 ms to the next. The first two rows have the authors' own
-numbers and are never fitted. The refits are least squares in the displacement of half-second
+coefficients and are never fitted. The refits minimise squared errors of displacement in half-second
 windows. The last two rows follow the authors' recipe: s = 1 - w_eff / w of each wheel and window,
 with w_eff from the pose; only samples with 0 < s <= 1 and I > 0.25 A are kept, which truncates the
 response that is fitted.
@@ -62,7 +62,7 @@ MOST_SAMPLES = 3000
 
 @dataclass(frozen=True)
 class _AsPublished(WheelSlip, abc.ABC):
-    """A slip model with the authors' own numbers, which is never fitted."""
+    """A slip model with the authors' own coefficients, which is never fitted."""
 
     learns: ClassVar[bool] = False
     needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
@@ -109,7 +109,7 @@ def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
     rim = signals.speed * spec.wheel_radius
     real = w.twist @ spec.forward.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        # A wheel at rest has no finite slip ratio, and no comparison is true for it.
+        # a wheel at rest has no finite slip ratio: the comparisons below are false for it
         slip = 1.0 - real / rim
     amps = signals.along(spec)
     kept = (slip > 0.0) & (slip <= 1.0) & (amps > FIGURES_3_AND_4.min_current)
@@ -176,7 +176,7 @@ class PaperSvr(WheelSlip):
 
 
 def refits() -> list[CurveModel]:
-    """Return curves of the printed and of the deployed form, unfitted, clipped to [-1, 1]."""
+    """Return curves of the printed and the deployed form before their fit, clipped to [-1, 1]."""
     deployed = above(tables.DEPLOYED_THRESHOLD)
     return [
         CurveModel("paper_print_refit", powers(0, 1, 2), RunSignals.torque, most=1.0, needs=NEEDS),
@@ -192,6 +192,6 @@ def refits() -> list[CurveModel]:
 
 
 def paper_rows() -> list[SlipModel]:
-    """Return the paper's rows, unfitted."""
+    """Return the models of the paper's rows before their fit."""
     svr = PaperSvr("paper_linear_svr", 1), PaperSvr("paper_quadratic_svr", 2)
     return [PaperPrint(), PaperCode(), *refits(), *svr]

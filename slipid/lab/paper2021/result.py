@@ -140,7 +140,7 @@ class PaperResult:
     transfer: Content | None
 
     def as_dict(self) -> dict[str, object]:
-        """Return all numbers by name, ready for JSON."""
+        """Return all numbers keyed by name, ready for JSON."""
         return {
             "schema": SCHEMA,
             "figure2": _table_dict(1, self.field),
@@ -177,7 +177,7 @@ def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
     Args:
         folder: folder of the 2021 data set.
         logs: the 2022 runs on one surface each, for the transfer between surfaces; None if the
-            transfer is not wanted.
+            transfer is not computed.
     """
     return PaperResult(
         field=field_table(folder),

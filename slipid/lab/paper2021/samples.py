@@ -45,11 +45,11 @@ class Recipe:
         back_emf: C_e [V s/rad], as in the authors' scripts.
         row_period: divisor of each row's pose delta [s]; the rows are about 0.45 s apart.
         delta_columns: pose deltas used, x, y [mm] and heading [deg].
-        drop_rotation: leave out rows with a rotation command.
-        speed_limit: rows with any |w_eff| at or above it are left out as camera jumps [rpm of the
+        drop_rotation: True to omit rows with a rotation command.
+        speed_limit: rows with any |w_eff| at or above it are omitted as camera jumps [rpm of the
             motor shaft].
-        min_current: samples with a current at or below it are left out as idling [A].
-        max_torque: samples with M above it are left out [N m].
+        min_current: samples with a current at or below it are omitted as idling [A].
+        max_torque: samples with M above it are omitted [N m].
     """
 
     wheel_radius: float = 0.040
@@ -110,10 +110,10 @@ def pool(parts: Sequence[SlipSamples]) -> SlipSamples:
 
 
 def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> SlipSamples:
-    """Return the samples of one motor that the recipe does not leave out.
+    """Return the samples of one motor that the recipe does not omit.
 
     Args:
-        table: logged columns by name, in the units of the file.
+        table: logged columns keyed by name, in the units of the file.
         motor: number of the motor, from 1.
         recipe: the authors' processing.
     """
@@ -125,7 +125,7 @@ def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Sl
     speed = table[f"Motor {motor} velocity, rpm"] * rpm
     current = table[f"Motor {motor} current, A"]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # A wheel at rest has no finite slip ratio, and no comparison below is true for it.
+        # a wheel at rest has no finite slip ratio: the comparisons below are false for it
         slip = 1.0 - effective[:, motor - 1] / speed
         voltage = recipe.back_emf * speed + recipe.resistance * current * np.sign(speed)
         torque = voltage * current / speed
@@ -156,7 +156,7 @@ def needed(recipe: Recipe) -> list[str]:
 
 
 def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Return every column of a file by name, in the units of the file.
+    """Return the columns of a file, keyed by name, in the file's own units.
 
     Raises:
         DataError: the file cannot be read, contains a cell that is not a finite number, or lacks a

@@ -32,11 +32,11 @@ The authors fitted it to motor 1 by a quadratic SVR; M is at the motor shaft.
 DEPLOYED_GAIN, DEPLOYED_OFFSET = (-0.639, -0.4559, -0.6294), (0.988, 0.9678, 0.9913)
 """Coefficients a [1/A] and b [-] of `deployed_slip` for motors 1, 2, 3."""
 DEPLOYED_THRESHOLD = 0.4
-"""Smoothed current up to which a wheel counts as not slipping [A]."""
+"""Largest smoothed current at which a wheel counts as not slipping [A]."""
 DEPLOYED_MEMORY = 0.97
 """Weight of the previous smoothed current in the next one [-]."""
 
-# by name of the form: the regressor, and its powers in the design matrix
+# keyed by name of the form: the regressor, and its powers in the design matrix
 _FORMS = {
     "linear in M": ("torque", (1,)),
     "affine in M": ("torque", (0, 1)),
@@ -88,7 +88,7 @@ class MotorTable:
     Attributes:
         samples: samples to which the models are fitted.
         by_surface: the same samples by surface; empty for the whole field.
-        forms: least-squares fits by name of the form.
+        forms: least-squares fits keyed by name of the form.
         stored: model with the paper's own coefficients for motor 1, not refitted; None for other
             motors.
     """

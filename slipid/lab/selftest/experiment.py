@@ -35,9 +35,9 @@ The tests check whether its 90 % intervals contain the truth often enough, and w
 agree with its standard deviations. A parameter that fails one of them was recovered wrongly, unless
 it counts as not recovered anyway."""
 LEAST_CONVERGED = 0.75
-"""Smallest share of the replicates' fits that must converge for a successful self test."""
+"""Smallest fraction of the replicates' fits that must converge for a successful self test."""
 VERDICT_ORDER = ("identified", "weak", "not_identified", "at_bound")
-"""Verdicts of a fit; of equally frequent ones, the last in this order counts."""
+"""Verdicts of a fit; if several are equally frequent, the last one in this order is reported."""
 
 
 def selftest(
@@ -61,12 +61,12 @@ def selftest(
     task = planned_task(config, report) if data is None else read_fit_task(config, data, report)
     problem = task.problem()
     wanted = wanted_paths(config, problem)
-    test.plausible(config, task.choices, problem)
+    test.plausible(task, problem)
     writable(out)
     report.stage("expected information")
     before = expected(task, problem)
     kept = Checkpoint(out, key_of(config.hash, task.data_hash, seed))
-    rows = test.replicates(config, task.choices, problem, count, seed, kept, report)
+    rows = test.replicates(task, problem, count, seed, kept, report)
     found = {
         "schema": SCHEMA,
         "source": "plan" if data is None else "logs",
@@ -129,9 +129,7 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     paths = [e.path for e in problem.space.free] + [e.path for e in ratios]
     given = config.content.selftest.wanted
     patterns = ["surface.*.creep"]
-    if (
-        problem.robot.geometry.determines_twist
-    ):  # The logs of other drives hardly show the distribution of the weight.
+    if problem.robot.geometry.determines_twist:  # other drives depend little on load
         patterns += ["surface.*.roller_drag", "robot.load_share@*"]
     patterns += ["surface.*.friction/motor.back_emf"] if w.has_current else []
     patterns += ["motor.resistance", "motor.back_emf"] if w.has_current and w.has_voltage else []
@@ -151,7 +149,7 @@ def summary(replicates: Sequence[Replicate], wanted: Sequence[str]) -> Content:
     Returns:
         Content of selftest.json: errors, coverage, verdict and recovery of each of the
         `parameters` (ratios included); errors of `curves` and `predictions` by floor; `failed`, the
-        wanted parameters that were not recovered; `recovered`, True if there are none of these and
+        required parameters that were not recovered; `recovered`, True if there are none, and if
         enough fits converged.
     """
     first = replicates[0]

@@ -11,6 +11,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import jax
@@ -31,7 +32,7 @@ from slipid.support.blocks import in_blocks
 
 
 def true_numbers(robot: Robot) -> dict[str, float | list[float]]:
-    """Return the value of every parameter of a robot by its path, as plain numbers."""
+    """Return the value of every parameter of a robot as plain numbers, keyed by path."""
     return {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)}
 
 
@@ -46,7 +47,7 @@ _FLOORS = {
     "scrub": (0.001, 0.002),
     "lead": (0.0015, 0.0045),
 }
-"""True surface parameters of the floors "firm" and "soft" in SI units, by name."""
+"""True surface parameters of the floors "firm" and "soft" in SI units, keyed by name."""
 TRUTH: dict[str, float | tuple[float, ...]] = {
     "robot.mass": 12.0,
     "robot.load_share@as_built": (0.29, 0.42, 0.29),
@@ -100,15 +101,14 @@ def heading_grid(
     At each speed [m/s] there are straight runs in `headings` directions, and `turns` curves.
     """
     drives = []
-    for surface, load in setups:
-        for speed in speeds:
-            angles = 2 * np.pi * np.arange(headings) / headings
-            drives += [PlannedRun(surface, load, float(angle), speed) for angle in angles]
-            angles = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
-            drives += [
-                PlannedRun(surface, load, float(angle), speed, turn=(-1) ** k * 4.0 * speed)
-                for k, angle in enumerate(angles)
-            ]
+    for (surface, load), speed in product(setups, speeds):
+        angles = 2 * np.pi * np.arange(headings) / headings
+        drives += [PlannedRun(surface, load, float(angle), speed) for angle in angles]
+        angles = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
+        drives += [
+            PlannedRun(surface, load, float(angle), speed, turn=(-1) ** k * 4.0 * speed)
+            for k, angle in enumerate(angles)
+        ]
     return tuple(drives)
 
 
@@ -122,13 +122,12 @@ def turning_grid(
     radius is the speed.
     """
     drives = []
-    for surface, load in setups:
-        for speed in speeds:
-            for angle in 2 * np.pi * np.arange(count) / count:
-                # rounded, since the computed cosine of a right angle is not exactly zero
-                ahead, turn = (round(speed * float(f(angle)), 9) for f in (np.cos, np.sin))
-                back = 0.0 if ahead >= 0 else np.pi
-                drives.append(PlannedRun(surface, load, back, abs(ahead), turn=turn / base_radius))
+    angles = (2 * np.pi * np.arange(count) / count).tolist()
+    for (surface, load), speed, angle in product(setups, speeds, angles):
+        # rounded, since the computed cosine of a right angle is not exactly zero
+        ahead, turn = (round(speed * float(f(angle)), 9) for f in (np.cos, np.sin))
+        back = 0.0 if ahead >= 0 else np.pi
+        drives.append(PlannedRun(surface, load, back, abs(ahead), turn=turn / base_radius))
     return tuple(drives)
 
 
@@ -148,7 +147,7 @@ class SimulatedSensors:
         wobble: amplitude of an oscillation of the wheel angle, divided by the wheel speed [s]; it
             imitates the speed control, which is never perfectly steady.
         has_voltage: True if voltages are logged.
-        signed: True if currents are logged with their sign.
+        signed: True if currents are logged with sign, False for magnitudes.
     """
 
     std: Mapping[str, float] = field(

@@ -68,7 +68,7 @@ class SimulationPlan:
         hash: hash of the config and of the map files it names.
         content: content of the config.
         site: robot, sensors and surfaces.
-        maps: maps of floors with several surfaces, by name.
+        maps: maps of floors with several surfaces, keyed by name.
         runs: name and program of each run.
         filmed: names of the runs that are filmed.
     """
@@ -93,9 +93,7 @@ def plan(path: Path, text: str) -> SimulationPlan:
     """
     mapping = mapping_of(path, text)
     surfaces = mapping.get("surfaces", {})
-    if isinstance(
-        surfaces, dict
-    ):  # Keys that are missing in the config keep the defaults of slipid.
+    if isinstance(surfaces, dict):  # keys that the config omits keep their default values
         known = {
             name: {**asdict(SURFACES[name]), **given}
             for name, given in surfaces.items()

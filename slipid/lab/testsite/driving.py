@@ -45,8 +45,8 @@ class Waypoints:
     Attributes:
         places: x, y [m] in the frame of the pose.
         speed: speed between the positions [m/s].
-        by: pose that is fed back: `encoders` for dead reckoning from the start, `camera` for the
-            true pose.
+        by: pose that is used as feedback: `encoders` (dead reckoning from the start) or `camera`
+            (the true pose).
     """
 
     places: tuple[tuple[float, float], ...]
@@ -58,7 +58,7 @@ class Waypoints:
 
         It ends earlier if too much time passes: 10 s and three times the duration without slip.
         """
-        # The start is not among the way-points; closing the path makes it at least as long.
+        # the way from the start is not among the places: count that from the last place instead
         corners = np.array([self.places[-1], *self.places])
         longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / self.speed
         pose, back = np.zeros(3), np.linalg.pinv(plant.robot.wheel_from_twist)
@@ -120,7 +120,7 @@ class SiteRun:
 def straight(
     surface: str, load: str, heading: float, speed: float, distance: float, turn: float = 0.0
 ) -> SiteRun:
-    """Return a run with a constant command, which without slip has its middle at the origin.
+    """Return a run with a constant command; without slip, the middle of its path is the origin.
 
     Args:
         surface: name of the surface.
@@ -170,7 +170,7 @@ class Trace:
         voltage: voltage of each motor, signed along the drive direction [V].
         bus: voltage of the supply [V].
         sinkage: depth to which each wheel has sunk [m].
-        twist_command: twist that was sent to the robot at this time [m/s, m/s, rad/s].
+        twist_command: twist commanded to the robot at this time [m/s, m/s, rad/s].
     """
 
     time: Float[np.ndarray, " step"]

@@ -14,7 +14,7 @@ from slipid.support.errors import DataError
 TIMESTEP = 1e-3
 """Time step of the engine and of the speed loop [s]."""
 SETTLING_S = 0.4
-"""Time for which the robot settles on the floor before anything is recorded [s]."""
+"""Time for which the robot settles on the floor before recording starts [s]."""
 LOOKUP_STEPS = 5
 """Number of time steps from one lookup of the floor beneath the rollers to the next."""
 RESISTANCE_SPEED = 0.02
@@ -142,7 +142,7 @@ class SimulatedRobot:
         m.dof_damping[self.wheel_dof] = motor.viscous_nms
 
     def _lay(self, terrain: Terrain) -> None:
-        """Store the contact parameters of every kind of the terrain."""
+        """Store the contact parameters of every kind of floor in the terrain."""
         self.terrain = terrain
         kinds = terrain.kinds
         self._friction = np.array([[g.friction, 0.003, f * g.rolling_m] for g, f in kinds])

@@ -143,7 +143,7 @@ class RobotBuild:
 
     Attributes:
         mass_kg: mass of the whole robot [kg].
-        centres_m: x, y of the centre of mass by load set-up [m].
+        centres_m: x, y of the centre of mass, keyed by load set-up [m].
         centre_height_m: height of the centre of mass above the wheel axes [m].
         wheel_azimuths_deg: azimuths of the wheel centres; the drive direction of each wheel is 90
             deg further [deg].
@@ -230,9 +230,9 @@ class RobotBuild:
         return np.concatenate([ahead, turn], axis=1) / self.wheel_radius_m
 
     def load_share(self, load: str) -> Float[np.ndarray, " wheel"]:
-        """Return the share of the weight on each wheel, from static equilibrium.
+        """Return the fraction of the weight on each wheel, from static equilibrium.
 
-        With more than three wheels it is the solution of smallest norm.
+        With more than three wheels, the minimum-norm solution is used.
         """
         count = len(self.wheel_azimuths_deg)
         level = np.concatenate([np.ones((1, count)), self.places.T])
@@ -247,10 +247,10 @@ def mjcf(
     looks: str = "",
     floor_looks: str = "",
 ) -> str:
-    """Return MuJoCo's XML of the robot at the origin of a flat floor.
+    """Return a MuJoCo model (XML) of the robot at the origin of a flat floor.
 
-    The contact parameters of rollers have priority over those of the floor, so that `plant` can
-    give each roller those of the surface beneath it.
+    Contact parameters of the rollers override those of the floor, so that `plant` can set those of
+    the surface beneath each roller.
 
     Args:
         robot: dimensions and masses of the robot.
@@ -261,7 +261,7 @@ def mjcf(
         floor_looks: XML attributes of the floor's plane for pictures.
     """
     m = robot
-    # the chassis' centre of mass is such that chassis and wheels together have that of the load
+    # place the chassis' centre of mass so that the whole robot has that of the load set-up
     wheels = (m.mass_kg - m.own_mass_kg) * m.places.mean(axis=0)
     x, y = (m.mass_kg * np.array(m.centres_m[load]) - wheels) / m.own_mass_kg
     inertia = m.own_mass_kg * np.array([0.012, 0.012, 0.016])
@@ -288,7 +288,7 @@ def mjcf(
 
 
 def _body_geoms(m: RobotBuild) -> str:
-    """Return XML of body and marker, which only appear in pictures and never collide."""
+    """Return the XML of body and marker, which are only drawn and never collide."""
     from_axis = m.marker_height_m - m.wheel_radius_m
     half, edge = 0.5 * m.marker_size_m, 0.62 * m.marker_size_m
     nothing = 'contype="0" conaffinity="0" mass="0"'
@@ -305,11 +305,11 @@ def _body_geoms(m: RobotBuild) -> str:
 
 
 def _wheel(m: RobotBuild, k: int) -> str:
-    """Return XML of wheel `k` with its rollers."""
+    """Return the part of the MuJoCo model (XML) with wheel `k`, from 0, and its rollers."""
     azimuth = np.radians(m.wheel_azimuths_deg[k])
     x, y = m.places[k]
     ring = m.wheel_radius_m - m.roller_radius_m
-    # half of a roller's length, such that rollers of both rows meet at the rim
+    # `half`: half of a roller's length, with which the rollers of both rows meet at the rim
     step = np.pi / m.rollers
     half = ring * (1 - np.cos(step)) / np.sin(step)
     parts = [

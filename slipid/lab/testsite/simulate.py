@@ -95,7 +95,7 @@ def _camera(
     """Return the logged marker pose in each row, and True for rows that have a new frame."""
     s = site.sensors
     delay = s.lag_s - 0.5 * s.frame_s
-    first = -(s.lag_s + 3 * s.frame_s)  # The first row then has a frame.
+    first = -(s.lag_s + 3 * s.frame_s)  # early enough for a frame in the first row
     taken = np.arange(first, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
     taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken + delay <= 0.0)]
     poses = interpolate(trace.time, trace.pose, taken)
@@ -120,7 +120,7 @@ TRUTH_STEP = 10
 
 @dataclass(frozen=True, eq=False)
 class SiteTask:
-    """Task of driving and writing one run, which may run in another process."""
+    """Task of driving and writing one run, which may be executed in a separate process."""
 
     name: str
     run: SiteRun
@@ -179,8 +179,7 @@ def _film(
         return
     write_json(tasks[0].out / "video" / "camera.json", camera.to_json())
     report.stage(f"filming {len(todo)} of {len(tasks)} runs")
-    # films are made in other processes, since MuJoCo's drawing backend must be chosen before it is
-    # imported
+    # use other processes: MuJoCo's drawing backend can be chosen only before MuJoCo is imported
     with Processes(1) if isinstance(executor, InProcess) else nullcontext(executor) as apart:
         results(apart, film_and_write, todo, report)
 
@@ -227,7 +226,7 @@ def drive_and_write(task: SiteTask) -> float:
 
 
 def _seed(seed: int, k: int) -> int:
-    """Return the seed of run `k`, which does not depend on later runs."""
+    """Return the seed of run `k`; it does not depend on the number of runs."""
     return int(np.random.SeedSequence(seed, spawn_key=(k,)).generate_state(1)[0])
 
 
@@ -273,7 +272,7 @@ def _write_truth(plan: SimulationPlan, out: Path) -> None:
 
 
 def truth(site: Site) -> dict[str, Content]:
-    """Return true value and unit of the site's parameters that a fit also has, by path."""
+    """Return true value and unit of the site's parameters that a fit also has, keyed by path."""
     robot, motor, sensors = site.robot, site.motor, site.sensors
     found: dict[str, tuple[float | list[float], str]] = {
         f"robot.load_share@{load}": (robot.load_share(load).tolist(), "1")

@@ -39,8 +39,8 @@ class SiteSensors:
         camera_scale: true length over logged length; 1.117 for the camera of the 2022 logs.
         camera_noise_m, camera_noise_rad: std of the noise of position [m] and heading [rad] in each
             frame.
-        dropout: share of the frames that are lost.
-        outlier, outlier_m: share of the frames with a wrong position, and std of their error [m].
+        dropout: fraction of the frames that are lost.
+        outlier, outlier_m: fraction of frames with a wrong position, and std of their error [m].
     """
 
     row_s: Interval = 0.031
@@ -99,7 +99,7 @@ class Site:
         motor: the robot's motors.
         loop: the robot's controller of wheel speed.
         sensors: errors of the logged sensors.
-        surfaces: physics of every surface, by name.
+        surfaces: physics of every surface, keyed by name.
         command_delay_s: time from a command to the change of the wheels' target speed [s].
         acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
     """
@@ -139,7 +139,8 @@ class SiteCamera:
         flicker: relative amplitude of changes of the light over some seconds.
         exposure_s: exposure time of a frame; moving objects appear twice, at its start and end [s].
         frame_s: time between frames [s].
-        early_s: time by which the video starts before the robot's log, and its clock is ahead [s].
+        early_s: time by which the video starts before the robot's log; video times count from its
+            own start, so they are ahead of the log's by the same time [s].
     """
 
     height_m: Positive = 2.2

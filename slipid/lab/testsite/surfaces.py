@@ -17,7 +17,7 @@ GRAVITY = 9.81
 LEVELS = 7
 """Number of levels to which the random unevenness of a floor is rounded."""
 ARENA_HALF = 1.6
-"""Half the edge length of the square around the start that represents a single surface [m]."""
+"""Half the edge length of the square floor around the start if there is a single surface [m]."""
 GRID_CELL = 0.005
 """Cell size of the floor's lookup grid, which is larger on very large floors [m]."""
 
@@ -73,7 +73,7 @@ SURFACES: dict[str, SurfacePhysics] = {
 
 
 class Terrain:
-    """The floor around a start, divided into kinds: surfaces at levels of their random unevenness.
+    """The floor around a start, divided into kinds: a kind is a surface at a level of unevenness.
 
     Attributes:
         kinds: surface of each kind, and the factor of its rolling friction and shear compliance.

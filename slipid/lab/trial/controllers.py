@@ -14,16 +14,17 @@ from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.controller import Gains, Law, Limits
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.trajectory import ROW_PERIOD, rectangle
+from slipid.robot.trajectory import STEP, rectangle
 from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
 
 TUNING_STARTS = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))
-"""Start poses beside the path, relative to its start, for tuning published laws [m, m, rad]."""
+"""Start poses of the robot, relative to the start of the path, with which the gains of published
+control laws are tuned [m, m, rad]."""
 
 
 def _indiveri(robot: DeployedRobot) -> Law:
-    """Return Indiveri's law for the identified wheels, with slipid's hand-set gains."""
+    """Return Indiveri's control law for the identified wheels, with slipid's hand-set gains."""
     numbers, wheels, gains = robot.record.parameters, robot.record.wheels, Gains()
     matrix = inverse_kinematics(
         np.asarray(robot.places),
@@ -37,17 +38,17 @@ def _indiveri(robot: DeployedRobot) -> Law:
 
 @cache
 def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
-    """Return gains of Goswami and Padhy's law, tuned on the first two sides of the rectangle [1/s].
+    """Tune the gains of Goswami and Padhy's control law on two sides of the rectangle [1/s].
 
-    The other two sides mirror these. The tuning uses an ideal robot with the default delay and lag
-    of twins, so that the gains are the same for all robots.
+    The other two sides are mirror images. The tuning uses an ideal robot with the default delay and
+    lag of twins, so that the gains are the same for all robots.
     """
     path, actuators = rectangle(), ActuatorModel()
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
-    own = ROW_PERIOD * np.arange(len(rows))
+    own = STEP * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
     task = TuningTask(
-        reference, np.array(TUNING_STARTS), actuators.command_shares(), actuators.lag_gain, PERIOD
+        reference, np.array(TUNING_STARTS), actuators.command_weights(), actuators.lag_gain, PERIOD
     )
     return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
 
@@ -91,16 +92,16 @@ def check_gains(out: Path, robot: DeployedRobot) -> None:
     """Raise `DataError` if the robot's file, in `out`, has no tuned gains for its load set-up."""
     tuned, path = robot.record.gains, out / "robot.json"
     if tuned is None:
-        raise DataError(f"{path}: no tuned gains; leave out --tuned-gains")
+        raise DataError(f"{path}: it has no tuned gains; omit --tuned-gains")
     if tuned.load != robot.load_setup:
         raise DataError(
             f"{path}: gains were tuned for another load set-up ({tuned.load}), not for "
-            f"{robot.load_setup}; leave out --tuned-gains, or drive with --load {tuned.load}"
+            f"{robot.load_setup}; omit --tuned-gains, or drive with --load {tuned.load}"
         )
 
 
 def unused_gains(robot: DeployedRobot, forced: bool) -> str:
-    """Return a sentence about tuned gains of the robot file that are not used, with the reason.
+    """Return a sentence about tuned gains in the robot file that are not used, with the reason.
 
     It is empty if all are used, or there are none. `forced` is the option --tuned-gains.
     """

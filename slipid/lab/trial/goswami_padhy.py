@@ -9,8 +9,8 @@ heading error e_th, the path's position p_d and turn rate W_d, and the heading t
 so that the Lyapunov function V falls for all positive gains, if the robot follows commands at once.
 
 Gains are tuned on an ideal robot with delay and lag: among gains in [0, 5], those that minimise the
-integral of V over a path that starts beside the reference. For a robot with the lag of the twin, k1
-and k2 end at the upper bound, 5, and k3 at 4.67.
+integral of V over time, from start poses off the reference path. For a robot with the lag of the
+twin, k1 and k2 end at the upper bound, 5, and k3 at 4.67.
 
 - row `goswami_padhy`: by a swarm of 30 particles in 50 iterations, inertia 0.7, c1 = c2 = 1.5.
 - row `goswami_padhy_gradient`: the same integral is minimised by a quasi-Newton method with bounds
@@ -27,12 +27,12 @@ Liberties:
 
 - The law is the form for robots that can drive sideways, as other papers quote it; the text of the
   paper itself was not available.
-- The tuned cost is the integral of V over the path of the trial, from several start poses beside
-  it, for a robot without slip whose twist follows commands with the twin's delay and lag. The
+- The tuned cost is the integral of V along the path of the trial, from several start poses off the
+  path, for a robot without slip whose twist follows commands with the twin's delay and lag. The
   paper's own robot, path and cost are not reproduced.
-- In the tuning, all wheels have the same delay and lag, which the twist then has too; limits of
-  speed, acceleration and voltage are left out, the pose is known, and the path does not wait for
-  the robot.
+- In the tuning, all wheels have the same delay and lag, which the twist then has too; speed,
+  acceleration and voltage are not limited, the pose is known, and the path does not wait for the
+  robot.
 - As in all rows of the trial, the law is evaluated once per period with the pose by the encoders,
   and its commands are subject to the same limits.
 - Particles start at rest at uniformly random points of the box. A coordinate that would leave the
@@ -63,7 +63,7 @@ class Swarm:
     Attributes:
         particles: number of particles.
         iterations: number of iterations.
-        inertia: share w of its velocity that a particle keeps.
+        inertia: fraction w of its velocity that a particle keeps.
         own: weight c1 of a particle's own best point.
         others: weight c2 of the best point of all particles.
     """
@@ -82,10 +82,9 @@ def minimise(
     swarm: Swarm,
     seed: int = 0,
 ) -> tuple[Float[np.ndarray, " n"], list[float]]:
-    """Return the best point that a swarm finds in a box, and the smallest costs found.
+    """Return the best point that a swarm finds in a box, and how the smallest cost so far fell.
 
-    The costs are those found up to the start and up to each iteration. Both results depend on the
-    seed only.
+    It is given for the start and after each iteration. The same seed gives the same results.
 
     Args:
         cost: function to minimise.
@@ -174,39 +173,39 @@ class GoswamiPadhy(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class TuningTask:
-    """Problem on which gains are tuned: an ideal robot with delay and lag starts beside a path.
+    """Simulation with which gains are tuned: an ideal robot with delay and lag follows a path.
 
     Attributes:
         reference: pose and rates of the path [m, m, rad, m/s, m/s, rad/s], one row per period.
-        begin: start poses of the robot [m, m, rad].
-        shares: weights of the last commands, newest first, in the command that arrives in each
-            substep; they describe the delay.
-        follow: share of the difference to the arrived command by which the twist changes in a
-            substep; it describes the lag.
+        begin: start poses of the robot, off the path [m, m, rad].
+        delay_weights: weight of each of the last commands, newest first, in the delayed command of
+            each substep of a period.
+        lag_gain: fraction of the difference between the delayed command and the twist by which the
+            twist changes in a substep (first-order lag).
         period: time between commands [s].
     """
 
     reference: Float[np.ndarray, "step 6"]
     begin: Float[np.ndarray, "start 3"]
-    shares: Float[np.ndarray, "substep command"]
-    follow: float
+    delay_weights: Float[np.ndarray, "substep command"]
+    lag_gain: float
     period: float
 
     def integrals(self, gains: Places) -> Float[np.ndarray, " particle"]:
         """Return the mean over starts of the integral of V over time, for many gains at once."""
-        k, h = gains.T[..., None], self.period / len(self.shares)
+        k, h = gains.T[..., None], self.period / len(self.delay_weights)
         pose = np.repeat(self.begin.T[:, None], len(gains), axis=1)
         velocity, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
-        ring = np.zeros((self.shares.shape[1], *pose.shape))
+        recent = np.zeros((self.delay_weights.shape[1], *pose.shape))
         for row in self.reference:
             wanted, rates = np.broadcast_to(row.reshape(2, 3, 1, 1), (2, *pose.shape))
             e = tracking_error(wanted, pose)
             total += lyapunov(e)
-            ring[1:] = ring[:-1]
-            ring[0] = twist(k, e, rates, pose[2])
-            arrives = self.shares @ ring.reshape(len(ring), -1)
-            for arrived in arrives.reshape(-1, *pose.shape):
-                velocity = velocity + self.follow * (arrived - velocity)
+            recent[1:] = recent[:-1]
+            recent[0] = twist(k, e, rates, pose[2])
+            commands = self.delay_weights @ recent.reshape(len(recent), -1)
+            for delayed in commands.reshape(-1, *pose.shape):
+                velocity = velocity + self.lag_gain * (delayed - velocity)
                 pose = _next_pose(pose, velocity, h)
         return self.period * total.mean(axis=1)
 
@@ -223,7 +222,7 @@ class TuningTask:
 def _next_pose(
     pose: Float[np.ndarray, "3 *batch"], velocity: Float[np.ndarray, "3 *batch"], h: float
 ) -> Float[np.ndarray, "3 *batch"]:
-    """Return poses after a short time `h` [s] at constant twists, by the midpoint heading."""
+    """Return poses after a short time `h` [s] at constant twists, by the midpoint rule."""
     x, y, turn = velocity
     middle = pose[2] + 0.5 * h * turn
     c, s = np.cos(middle), np.sin(middle)

@@ -21,7 +21,7 @@ Nothing is tuned: gains are the hand-set ones of slipid's pose loop.
 Liberties:
 
 - The law is implemented from its equations in other papers; the text of the paper itself was not
-  available. Its other treatments of wheels at their limit are left out; here one factor scales
+  available. Its other treatments of wheels at their limit are not included; here one factor scales
   translation and turning together.
 - The gains are not those of the paper. The row `encoder` has the same gains. It differs from this
   one by the sine of the heading error, and by the scaling above, after which the limits of all rows
@@ -75,10 +75,7 @@ def inverse_kinematics(
     lever = place[:, 0] * n[:, 1] - place[:, 1] * n[:, 0]
     matrix = np.column_stack([n, lever]) / (radius * across)[:, None]
     if np.linalg.matrix_rank(matrix, tol=1e-6 * np.abs(matrix).max()) < 3:
-        raise ValueError(
-            "the wheels do not determine the motion of the body; expected at least three "
-            "independent wheels"
-        )
+        raise ValueError("the wheels leave a motion of the body free; expected wheels that fix it")
     return matrix
 
 

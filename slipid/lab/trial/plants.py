@@ -17,7 +17,7 @@ from slipid.support.errors import DataError
 
 
 def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
-    """Raise `DataError` if the test site lacks the number of wheels, load set-up or a surface."""
+    """Raise `DataError` if the test site lacks a surface, the load set-up or so many wheels."""
     robot, other = Site().robot, "With --plant twin, the identified model itself is simulated"
     has = len(robot.wheel_azimuths_deg)
     if wheels != has:
@@ -72,7 +72,7 @@ class SitePlant:
         return self._read(np.zeros((1, 2 * len(self.plant.wheel_dof))))
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Measurement:
-        """Command wheel speeds [rad/s], advance by one period and return the measurement then."""
+        """Command wheel speeds [rad/s], advance by one period, and return the new measurement."""
         plant, drive, rows = self.plant, self.plant.drive, []
         self._rims.send(np.asarray(wheel_speed, float))
         for _ in range(round(PERIOD / plant.dt)):

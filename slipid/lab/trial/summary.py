@@ -42,12 +42,12 @@ class TrialRun:
 def summaries(runs: Sequence[TrialRun]) -> dict[str, Content]:
     """Return the summary of every controller over its starts, in the form of trial.json.
 
-    A summary has the medians of the errors by name, see `columns`, without those that a plant does
-    not measure (the twin's energy); `interval90`, their 90 % intervals by bootstrap over starts;
-    `runs`, the number of runs; and `finished_share`, the share that reached the end of the path.
-    If the controller `encoder` is among them, it also has `worse_share`, the share of the starts
-    with a larger closure error than that controller's, and `to_encoder`, the ratios of medians to
-    its medians, each with its `value` and `interval90`.
+    A summary has the medians of the errors, keyed by the names of `columns`, without those that a
+    plant does not measure (the twin's energy); `interval90`, their 90 % intervals by bootstrap over
+    starts; `runs`, the number of runs; and `finished_share`, the fraction of runs that reached the
+    end of the path. If the controller `encoder` was driven, a summary also has `worse_share`, the
+    fraction of starts with a larger closure error than `encoder`'s, and `to_encoder`, the ratios of
+    medians to those of `encoder`, each with its `value` and `interval90`.
     """
     of = _by_controller(runs)
     table = {name: columns(mine) for name, mine in of.items()}
@@ -71,9 +71,9 @@ def summaries(runs: Sequence[TrialRun]) -> dict[str, Content]:
 def best_controllers(runs: Sequence[TrialRun]) -> tuple[str, ...]:
     """Return the controllers that may have the smallest closure error, the lowest median first.
 
-    The others are those whose errors are not clearly larger: the 90 % bootstrap interval of the
-    difference of medians, over the same starts, does not lie above 0. Only controllers with the
-    smallest number of unfinished runs are considered.
+    After it come those whose errors are not clearly larger: the 90 % bootstrap interval of the
+    difference of medians, over the same starts, includes 0. Only controllers with the smallest
+    number of unfinished runs are considered.
     """
     of = _by_controller(runs)
     unfinished = {name: sum(not run.metrics.finished for run in mine) for name, mine in of.items()}
@@ -101,10 +101,10 @@ def _resampled(of: Mapping[str, Sequence[TrialRun]]) -> Int[np.ndarray, "draw st
 
 
 def columns(runs: Sequence[TrialRun]) -> dict[str, Float[np.ndarray, " run"]]:
-    """Return the errors of every run by name.
+    """Return the errors of every run, keyed by the errors' names.
 
     `first_side_along_track_mm` and `heading_error_deg` are magnitudes; `first_side_travelled` is
-    the share of the first side that was travelled. The first side of a curve is its first quarter.
+    the fraction of the first side that was driven. The first side of a curve is its first quarter.
     """
     m = [run.metrics for run in runs]
     side, whole = np.array([(x.along_track_mm[0], x.sides_mm[0]) for x in m]).T

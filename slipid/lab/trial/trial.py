@@ -46,7 +46,7 @@ PLANTS = ("testsite", "twin")
 
 @dataclass(frozen=True, eq=False)
 class TrialTask:
-    """Task of driving one controller from one start.
+    """Task of driving one run: one controller from one start.
 
     Attributes:
         name: name of the run, `CONTROLLER/startNN`.
@@ -61,7 +61,7 @@ class TrialTask:
         settings: settings of the estimator.
         actuators: delay, lag and limits of the twin's wheel speeds.
         forced: True if tuned gains are used even if they are no better than hand-set ones.
-        kept: checkpoint with the finished runs.
+        kept: checkpoint that stores finished runs.
     """
 
     name: str
@@ -181,7 +181,7 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     floor = twin_floor(robot) if options.map is None else read_map(options.map)
     known_map = floor if options.told_map is None else read_map(options.told_map)
     settings, actuators = Settings.of(robot), actuator_model_of(robot, gyro=False)
-    if options.plant == "testsite":  # The site has the same sensors for all logs.
+    if options.plant == "testsite":  # the site's sensors do not depend on those of the logs
         refuse_unknown_to_site(floor, robot.load_setup, robot.wheels)
         settings, actuators = replace(settings, current_is_signed=False), ActuatorModel()
     else:
@@ -198,7 +198,7 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
         # Runs of another version of this code are not reused.
         source_hash("robot", "model", "lab/testsite", "data", "deploy", "lab/trial"),
     )
-    # Trials with other gains or floors have separate folders and can be reused.
+    # trials with other gains or floors have separate folders, so that their runs stay reusable
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{options.starts}", key)
     shared = options.plant, floor, known_map, robot, settings, actuators, options.tuned_gains, kept
     return [
@@ -244,7 +244,7 @@ def drive(task: TrialTask) -> None:
         metrics=closed_loop.path_metrics(driven),
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
-    # The path is saved first, because a run with saved errors counts as finished.
+    # save the path before the errors, because a run with saved errors counts as finished
     poses = {"time": driven.time, "pose": driven.pose, "believed": driven.estimated_pose}
     task.kept.save(task.name, poses)
     task.kept.save_json(task.name, asdict(run))

@@ -14,7 +14,7 @@ std, decorrelates as the direction changes, and once the robot has left the floo
 with `far` the path length of the step [m], v the settled direction, a low-pass filtered u, and
 `left` 1 if no wheel is on the floor, else 0. If the direction changes at once from v to u, the
 correlation becomes exp(-|u - v|^2 / (2 DIRECTION_STD^2)), in however many steps it is computed;
-jitter of the direction hardly changes it, and on a drive back the effect is independent of the
+jitter of the direction barely changes it, and on a drive back the effect is independent of the
 earlier one. Along an arc of curvature c [1/m] on which the direction turns by an angle [rad] the
 correlation falls more slowly, to about exp(-angle c SETTLING_LENGTH / DIRECTION_STD^2): after a
 quarter turn on a radius of one metre it is a fifth.
@@ -27,18 +27,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 DIRECTION_STD = 0.17
-"""Change of direction, as a std, over which an effect decorrelates [rad]; about 10 deg in real
-logs."""
+"""Width of the Gaussian over changes of direction with which an effect decorrelates [rad]: 10 deg,
+estimated from real logs."""
 SETTLING_LENGTH = 0.03
 """Path length constant of the low-pass filter of the direction of travel [m]."""
 LEAVING_LENGTH = 0.1
 """Path length off a floor over which its effect decorrelates by a factor of e [m]."""
 LOG_SPEED_STD = 0.5
-"""Difference of log speeds [1], as a std, over which estimates fade to 0 outside the speeds of the
-table; the fit uses the same number."""
+"""Width of the Gaussian over log speed with which estimates fade to 0 outside the speeds of the
+table [1]; the fit uses the same value."""
 TRAVEL_SHARE = 0.2
-"""A robot counts as travelling in a direction, and not as turning on the spot, if translation
-exceeds this share of its speed (see `RolledMotion.speed`) [1]; the fit uses the same number."""
+"""Ratio of translational speed to `RolledMotion.speed` above which a robot counts as travelling in
+a direction, not as turning on the spot [1]; the fit uses the same value."""
 
 
 class RolledMotion(eqx.Module):
@@ -79,7 +79,7 @@ class EffectLookup(eqx.Module):
     Attributes:
         log_speed: rising logarithms of the table's speeds [m/s].
         table: mean effect along, across [m/m] and in yaw [rad/m], then for each of the three the
-            remaining std as a share of the whole std [1].
+            remaining std as a fraction of the whole std [1].
     """
 
     log_speed: Float[Array, " speed"]
@@ -92,7 +92,7 @@ class EffectLookup(eqx.Module):
         return cls(jax.device_put(np.zeros(1)), jax.device_put(rows))
 
     def at(self, rolled: RolledMotion) -> tuple[Float[Array, "floor 3"], Float[Array, "floor 3"]]:
-        """Return the mean effect on every floor, and the remaining share of its std.
+        """Return the mean effect on every floor, and the remaining fraction of its std.
 
         The table is interpolated linearly over directions and speeds; outside the range of its
         speeds the estimates fade to 0.

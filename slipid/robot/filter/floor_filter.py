@@ -12,9 +12,9 @@ further hypothesis is "unknown":
 with p_c the probability of c, xi_c its body twist [m/s, m/s, rad/s], I the measured and I_c the
 predicted currents [A], and tau the time within which evidence repeats (`Settings.forget_s`) [s].
 
-The current of a wheel shows its share of the whole drag, not the drag of the floor under it; only
-all currents together distinguish the floors. Late evidence corrects the pose by the distance
-between the poses of the hypotheses (interacting multiple models; Blom and Bar-Shalom 1988).
+A wheel's current shows its fraction of the total drag, not the drag beneath it; only all currents
+together distinguish the floors. Evidence that comes late corrects the pose by the distance between
+the hypotheses' poses (interacting multiple models; Blom and Bar-Shalom 1988).
 """
 
 from dataclasses import replace
@@ -36,7 +36,7 @@ from slipid.robot.filter.wheels import MotorCurrents
 from slipid.robot.interface import Settings
 
 INERTIA_ACCELERATION = 30.0
-"""Wheel acceleration at which evidence about floors has half its weight, since the equilibrium
+"""Wheel acceleration at which evidence on floors has half its weight, since the contact equilibrium
 neglects inertia [rad/s^2]."""
 
 
@@ -191,7 +191,7 @@ class FloorFilter(eqx.Module):
         return FloorState(belief, expected, twist=settled, apart=apart), motion
 
     def _left(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
-        """Return the remaining std of every floor's effects as a share of the whole std [1].
+        """Return the remaining std of every floor's effects as a fraction of the whole std [1].
 
         With wheels on several floors the whole std remains, since the estimates are for all wheels
         on one floor.
@@ -270,7 +270,7 @@ class FloorFilter(eqx.Module):
     def _of_friction(self, amps: Float[Array, "hypothesis drive"]) -> Array:
         """Return the variance of currents due to uncertain friction of several floors [A^2].
 
-        A wheel carries a share of the whole drag in proportion to its floor's friction divided by
+        A wheel bears a fraction of the total drag in proportion to its floor's friction divided by
         the mean friction.
         """
         on = hypotheses_of(self.robot).on.astype(float)
@@ -279,7 +279,7 @@ class FloorFilter(eqx.Module):
         return amps**2 * self.robot.on_average(var.reshape(on.shape[:2]))
 
     def _stiction(self, w: Array) -> Array:
-        """Return the variance of the current of a wheel at standstill [A^2]; 0 for a turning wheel.
+        """Return the variance of the current of a wheel at rest [A^2]; it is 0 for a turning one.
 
         Static friction lets the current lie anywhere between two bounds, taken as uniform.
         """
@@ -318,9 +318,9 @@ class FloorFilter(eqx.Module):
             given = prior / jnp.sum(jnp.append(prior, 0.0)[beside], axis=1)
             others = jnp.sum(jnp.concatenate([p, none])[beside], axis=1)
             p = (1 - change) * p + change * given[:, None] * others
-        return self._estranged(p, change)
+        return self._unseen_changed(p, change)
 
-    def _estranged(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
+    def _unseen_changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
         """Return the belief after the whole robot may have moved to or from a hypothetical floor.
 
         Such a change is as improbable as one to the "unknown" floor.
@@ -359,8 +359,8 @@ def _followed(
 ) -> Float[Array, "hypothesis column"]:
     """Return the belief after a step of a robot whose map predicts the floors at its new pose.
 
-    Hypotheses whose probability by the map fell lose the same share of their belief to hypotheses
-    whose probability rose. In addition, a share `change` of the belief returns to the map's
+    Hypotheses whose probability by the map fell lose the same fraction of their belief to those
+    whose probability rose. In addition, a fraction `change` of the belief returns to the map's
     probabilities, in case the map is wrong.
     """
     gone = jnp.clip(1 - now / jnp.maximum(before, 1e-12), 0.0, 1.0)[:, None]

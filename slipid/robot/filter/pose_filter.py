@@ -47,7 +47,7 @@ class _StepMotion(eqx.Module):
         speed: `RolledMotion.speed`; effects are relative to it [m/s].
         axes: directions along, across and in yaw, as columns in the body frame.
         slope: derivative of the twist by the nuisance states without the gyro's bias.
-        share: expected share of the load on each floor [1].
+        share: expected fraction of the weight on each floor [1].
         by_gyro: True if a gyro measures the yaw rate.
     """
 
@@ -100,9 +100,9 @@ class PoseFilter(eqx.Module):
     ) -> tuple[PoseState, Float[Array, "3"], Float[Array, "3 3"]]:
         """Return the state one time step later, the twist of the step, and a factor on distances.
 
-        A pose fix also corrects the poses of the hypotheses: the factor (3, 3), in body axes, is
-        the share of their distances from the estimated pose that remains. It is the identity
-        without a fix.
+        A pose fix also corrects the poses of the hypotheses: their distances from the estimated
+        pose are to be multiplied by the factor (3, 3), in body axes. It is the identity without a
+        fix.
 
         Args:
             old: state before the step.
@@ -173,10 +173,10 @@ class PoseFilter(eqx.Module):
         added. `free` is the contact model's yaw rate [rad/s], which is returned without a gyro;
         ages in the history are those after the step.
         """
-        then = self._then(old, free)
+        then = self._yaw_rate_then(old, free)
         return jnp.where(jnp.isfinite(gyro), free + gyro - old.nuisance[-1] - then, free)
 
-    def _then(self, now: PoseState, free: Array) -> Array:
+    def _yaw_rate_then(self, now: PoseState, free: Array) -> Array:
         """Return the yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
         delay = self.settings.gyro_delay_s
         if not isinstance(delay, jax.core.Tracer) and float(delay) == 0.0:
@@ -202,7 +202,8 @@ class PoseFilter(eqx.Module):
         dt, cov = jnp.maximum(tick.dt, 1e-3), now.covariance
         look = jnp.concatenate([jnp.zeros(3), body.slope[2], jnp.ones(1)])
         usable = (body.speed > CREEP_SPEED) & jnp.isfinite(gyro) & (tick.dt > 0)
-        gap = jnp.where(usable, gyro - now.nuisance[-1] - self._then(now, free), 0.0)
+        then = self._yaw_rate_then(now, free)
+        gap = jnp.where(usable, gyro - now.nuisance[-1] - then, 0.0)
         walk = (body.share @ self.robot.process[:, 2] ** 2) * body.speed / dt
         noise = (self.settings.gyro_std**2 + walk) * (
             1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2

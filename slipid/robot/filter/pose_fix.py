@@ -52,8 +52,8 @@ class PoseState(eqx.Module):
 def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
     """Return the state corrected by a pose fix, if there is one, and the factor on distances.
 
-    The factor (3, 3), in world axes, is the share of a hypothesis's distance from the estimated
-    pose that remains after the fix; it is the identity without a fix.
+    The distance of each hypothesis's pose from the estimated pose is to be multiplied by the factor
+    (3, 3), in world axes; it is the identity without a fix.
     """
     age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
     has = (
@@ -118,8 +118,8 @@ def apply_map(
 ) -> tuple[PoseState, Float[Array, "3 3"]]:
     """Return the state after comparing the belief about floors with a map, and a factor.
 
-    The factor (3, 3), in world axes, is the share of a hypothesis's distance from the estimated
-    pose that remains.
+    The distance of each hypothesis's pose from the estimated pose is to be multiplied by the factor
+    (3, 3), in world axes.
 
     Args:
         now: pose and covariance.
@@ -154,13 +154,13 @@ def history_after_jump(
     """Return the history after late evidence on the floors moved the pose.
 
     The old and the new belief predict twists that differ; their poses are assumed to have diverged
-    at the present rate until now. Therefore, of the jump J between them, the share
+    at the present rate until now. So a path length s [m] ago, the fraction
 
         1 - s (j . J) / |J|^2,   j the divergence per metre
 
-    (limited to 0 ... 1, with yaw multiplied by the base radius) already existed a path length s [m]
-    ago. Past poses are shifted by that share of the jump. Otherwise a fix of an earlier time would
-    move the pose by the jump once more.
+    of the jump J between them (limited to 0 ... 1, with yaw multiplied by the base radius) already
+    existed a path length s [m] ago. Past poses are shifted by that fraction of the jump. Otherwise
+    a fix of an earlier time would move the pose by the jump once more.
     """
     scale = jnp.stack([jnp.ones(()), jnp.ones(()), base])
     jump, apart = scale * motion.jump, scale * motion.correction

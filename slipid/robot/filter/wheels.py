@@ -59,8 +59,8 @@ def read_wheels(
 ) -> WheelState:
     """Return wheel speeds, angles up to which motion has been counted, and ages of the readings.
 
-    A wheel without readings keeps its speed until it is stale; then its speed is taken as zero.
-    When its encoder works again, the next step includes the motion in between.
+    A wheel without readings keeps its speed until it is stale, then it counts as at rest. When its
+    encoder returns, the next step includes the motion missed in between.
     """
     most = 4.0 * robot.highest[0]
     turned = (z.wheel_angle - old.angle) / jnp.maximum(dt, 1e-3)
@@ -68,7 +68,7 @@ def read_wheels(
     by_speed = jnp.isfinite(z.wheel_speed) & (jnp.abs(z.wheel_speed) < most)
     read = jnp.where(by_angle, turned, jnp.where(by_speed, z.wheel_speed, old.speed))
     known = jnp.isfinite(z.wheel_angle) & (jnp.abs(z.wheel_angle) < 1e7)
-    # Without an earlier angle, the speed of a wheel is taken as zero.
+    # without an earlier angle a wheel counts as at rest
     first = known & ~jnp.isfinite(old.angle) & ~by_speed
     good = by_angle | by_speed | first
     # Readings without a valid time step do not reset the age.

@@ -192,7 +192,7 @@ def test_a_folder_without_pictures(tmp_path):
 
 
 def test_a_device_needs_an_end_and_has_its_own_times():
-    with pytest.raises(DataError, match="no end; expected --seconds"):
+    with pytest.raises(DataError, match="expected --seconds, the length"):
         open_source("0")
     with pytest.raises(DataError, match="no --fps"):
         open_source("/dev/video7", fps=30.0, seconds=1.0)

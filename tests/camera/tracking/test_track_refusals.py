@@ -108,7 +108,7 @@ def test_sources_that_cannot_be_read(made, tmp_path):
     assert "no picture" in refusal(made, tmp_path / "folder", *LONE, "--fps", 30)
     cv2.imwrite(str(tmp_path / "folder" / "a.png"), STAGE.frame(0.0, [ROBOT]))
     assert "--fps or --times" in refusal(made, tmp_path / "folder", *LONE)
-    assert "no end; expected --seconds" in refusal(made, 99, *LONE)
+    assert "expected --seconds, the length" in refusal(made, 99, *LONE)
     assert "cannot open it" in refusal(made, 99, *LONE, "--seconds", 1)
     (tmp_path / "t.csv").write_text("frame,time\n0,0\n1,0\n", encoding="utf-8")
     video = made.video("robot", ROBOT)

@@ -74,9 +74,10 @@ def cleaned(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
 def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> None:
     """Append a note if stamps and times of receipt are both used and clearly differ.
 
+    The note is added for differences from `NOTED_DIFFERENCE_S` on.
+
     Raises:
-        DataError: they differ by more than `LARGEST_DIFFERENCE_S`. (A note is added from
-            `NOTED_DIFFERENCE_S` on.)
+        DataError: they differ by more than `LARGEST_DIFFERENCE_S`.
     """
     used = [one for one in streams if len(one.number) and not one.topic.name.endswith(STATIC)]
     bare = sorted({one.topic.name for one in used if one.delay is None})
@@ -235,7 +236,7 @@ def checked_stream(stream: Stream) -> Stream:
     if len(stream.number):
         return stream
     found = f"no numbers in {', '.join(stream.columns)} of any message"
-    raise stream.error(found, "an array with values at the given index")
+    raise stream.error(found, "a non-empty array that has the requested index")
 
 
 def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:

@@ -46,7 +46,7 @@ PRIOR_MEANS = np.log([0.6, 0.15, 0.08])
 CURRENT_A, YAW_RATE = 1.0, 0.2
 """Scales by which residuals of currents [A] and of the yaw rate [rad/s] are divided."""
 CELL_ROWS, RUN_ROWS = 20.0, 300.0
-"""Numbers of rows, in one cell and in one run, above which more rows hardly add weight."""
+"""Numbers of rows, in one cell and in one run, above which more rows add little weight."""
 FLOOR_CELLS = 512
 """Largest number of cells of a floor; fewer are padded to it, so that one shape is compiled."""
 SPEED_STEP = 1e-3

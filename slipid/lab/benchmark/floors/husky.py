@@ -54,11 +54,11 @@ REQUIRED_COLUMNS = COLUMNS[:5]
 LARGEST_GAP_S = 0.5
 """Time between two rows above which a file is split into two runs there [s]."""
 FEWEST_ROWS = 3
-"""Smallest number of rows of a run; shorter runs are left out."""
+"""Smallest number of rows of a run; shorter runs are omitted."""
 
 
 def husky() -> Robot:
-    """Return the Husky with its manufacturer's data and measured friction, without floors."""
+    """Return the Husky with its maker's data and measured motor friction, without floors."""
     robot = build(skid_steer(0.256, 0.275, RADIUS, 78.71, drive_of=(0, 1, 0, 1)), ())
     gain = float(robot.motor.gain)
     motor = replace(
@@ -116,27 +116,9 @@ def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
 
 
 def husky_classifiers() -> list[FloorClassifier]:
-    """Return all classifiers, slipid first, unfitted."""
+    """Return all floor classifiers before their fit, slipid's first."""
     slipid = SlipidFloorClassifier(robot=husky(), zero_a=REST_READING_A)
     return [slipid, CosineEnergyClassifier(), GaussianClassifier(), *tree_classifiers()]
-
-
-def husky_table(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> ClassifierTable:
-    """Return the table of all classifiers, or of the named ones.
-
-    Args:
-        data: folder with the data sets.
-        quick: one fold, short times and default settings instead of the full evaluation.
-        only: names of rows; all if empty.
-
-    Raises:
-        DataError: the folder's files cannot be read.
-    """
-    runs = read_floor_runs(data / FOLDER, RADIUS)
-    spec = RobotSpec.of(husky().on(["any"]))
-    methods = [method for method in husky_classifiers() if not only or method.name in only]
-    settings = EvaluationSettings.quick() if quick else EvaluationSettings()
-    return classifier_table(methods, runs, spec, ABOUT, settings)
 
 
 class HuskyFloorTask(FloorTask):
@@ -155,4 +137,8 @@ class HuskyFloorTask(FloorTask):
         return hash_of((str(f.relative_to(root)), f.read_text(errors="replace")) for f in files)
 
     def make(self) -> ClassifierTable:
-        return husky_table(self.options.data, self.options.quick, self.options.only)
+        runs, only = read_floor_runs(self.options.data / FOLDER, RADIUS), self.options.only
+        spec = RobotSpec.of(husky().on(["any"]))
+        methods = [method for method in husky_classifiers() if not only or method.name in only]
+        settings = EvaluationSettings.quick() if self.options.quick else EvaluationSettings()
+        return classifier_table(methods, runs, spec, ABOUT, settings)

@@ -33,14 +33,14 @@ Accuracies = Content
 
 - seconds: length of the signals used [s].
 - stretches: number of stretches.
-- accuracy: share of the stretches in which the most probable floor is the true one.
+- accuracy: fraction of the stretches in which the most probable floor is the true one.
 - balanced: mean over floors of the accuracy on each floor.
 - behind: accuracy less that of slipid on the same resampled runs; None for slipid itself.
 - by_floor: accuracy on each floor.
 - log_score: mean natural logarithm of the probability of the true floor; 0 is best, and equal
   probabilities of n floors give log(1 / n).
 
-Of `accuracy`, `balanced` and `behind` there is the value and its interval (`MeanInterval`).
+Each of `accuracy`, `balanced` and `behind` has a value and its interval (`MeanInterval`).
 """
 ClassifierTable = Content
 """Table of all classifiers on one set of runs, in the form of benchmark.json.
@@ -54,7 +54,7 @@ ClassifierTable = Content
     - settings: settings picked by cross-validation in each fold, in words.
     - numbers: number of fitted parameters, median over folds.
     - after: accuracy after each time (`Accuracies`).
-    - said: confusion table after the longest time: `said[true][named]` is the share of the
+    - said: confusion table after the longest time: `said[true][named]` is the fraction of the
       stretches on the true floor in which a floor was named [%].
     - fit_s: time of one fit, median over folds [s].
     - tune_s: time to pick settings, median over folds [s].
@@ -99,7 +99,7 @@ def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> Accurac
 
 
 def confusion(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:
-    """Return the share of answers that name each floor, by true floor, after `seconds` s [%]."""
+    """Return the fraction of answers that name each floor, by true floor, after `seconds` s [%]."""
     mine = [a for a in answers if a.seconds == seconds]
     names = sorted({a.floor for a in mine} | {a.named for a in mine})
     table: dict[str, dict[str, float]] = {}

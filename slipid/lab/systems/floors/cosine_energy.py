@@ -58,8 +58,7 @@ from slipid.model.robot import GRAVITY
 from slipid.predict.slip_model import RobotSpec
 
 LEAST_SPEED = 0.02
-"""Rows with a speed u up to this are not used, since their direction of travel is undefined
-[m/s]."""
+"""Largest speed u of rows that are not used, since their direction of travel is undefined [m/s]."""
 
 
 @dataclass(frozen=True)

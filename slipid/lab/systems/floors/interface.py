@@ -33,7 +33,7 @@ FloorChannel = Literal["current", "gyro", "vibration"]
 DEFAULT_CHANNELS: frozenset[FloorChannel] = frozenset({"current", "gyro"})
 """Channels that slipid uses too, besides the wheel speeds."""
 REST_WHEEL_SPEED = 0.3
-"""Wheel speed up to which a wheel counts as at rest [rad/s]."""
+"""Largest wheel speed at which a wheel counts as at rest [rad/s]."""
 WINDOWS_S = (0.5, 1.0, 2.0)
 """Lengths of the feature windows [s]."""
 
@@ -209,10 +209,10 @@ def features(
 def yaw_rate_shortfall(
     gyro: Float[np.ndarray, " row"], rolling: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, " row"]:
-    """Return the shortfall of the body's yaw rate from that of the rolling wheels [rad/s].
+    """Return the shortfall of the body's yaw rate below that of the rolling wheels [rad/s].
 
-    It is the difference of the yaw rates from encoders and gyro, positive if the body turns less,
-    for both senses of rotation.
+    It is the difference of the yaw rates from encoders and gyro, positive where the body turns
+    less, for either sense of rotation.
     """
     return np.asarray(np.where(rolling < 0, gyro - rolling, rolling - gyro))
 

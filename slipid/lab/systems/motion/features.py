@@ -11,15 +11,15 @@ The target is the slip ratio of the body,
 
     ratio = (true twist - rolling twist) (1, 1, L) / size
 
-It has no unit and hardly depends on the speed where friction does not, so that a fit at one speed
-also holds at others; a target in m/s would not. The noise of the pose is divided by the size too,
-so windows are weighted by
+It has no unit, and where friction does not depend on the speed it depends little on it, so that a
+fit at one speed also holds at others, unlike a fit of a target in m/s. The noise of the pose is
+divided by the size too, so windows are weighted by
 
     weight ~ size^2 / (size^2 + (median size / 2)^2)
 
 This weight rises with the square of the size at low speeds, where the noise of the pose dominates,
 and is constant at high speeds, where the unexplained part of the slip dominates. Windows in which
-the wheels rest are left out. Predicted ratios are multiplied by the size again, so that a robot at
+the wheels rest are omitted. Predicted ratios are multiplied by the size again, so that a robot at
 rest does not slip.
 """
 

@@ -16,7 +16,7 @@ Liberties of the trees:
     - Each component has its own trees; there is no shrinkage but the rate, and no early stopping.
     - Windows are drawn at random in proportion to their weight and then have equal weights.
 
-Source: Friedman 2001, Greedy function approximation: a gradient boosting spec, Annals of
+Source: Friedman 2001, Greedy function approximation: a gradient boosting machine, Annals of
 Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn has it.
 
 Neural network. All three components of the slip ratio at once are

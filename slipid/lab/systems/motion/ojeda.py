@@ -24,7 +24,7 @@ runs for runs whose floor is not given or was not trained. Tuned: the low pass's
 Liberties:
     - The equations are restated, not copied: the length of windows, the prior variance, the order
       of the runs and the solvers are ours. The authors' correction for the pitch of the ground does
-      not apply here and is left out.
+      not apply here and is omitted.
     - The original corrects the velocity of rovers along their direction of motion; here the rim
       speed of each drive is corrected, which also works for omni robots. A correction never
       reverses a wheel.
@@ -73,7 +73,7 @@ SLIP_SIGMAS = 3.0
 LEAST_RIM_SPEED = 0.02
 """Mean rim speed above which the robot counts as moving [m/s]."""
 PRIOR_VARIANCE = 1e6
-"""Prior variance of k0 [m^2/s^2] and k1 [m^2/s^2/A^2], so large that it has hardly any effect."""
+"""Prior variance of k0 [m^2/s^2] and k1 [m^2/s^2/A^2], so large that it has almost no effect."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ Liberties:
   that are trained on poses; the original's own sets and rules are not used.
 - The slip score is the largest unclipped indicator of those that flag slip, or the fuzzy output; it
   is 0 at rest.
-- The original also measures the sinkage of its wheels by a camera; that is left out.
+- The original also measures the sinkage of its wheels by a camera; that is omitted.
 
 Source: Reina, Ojeda, Milella, Borenstein 2006, "Wheel slippage and sinkage detection for planetary
 rovers", IEEE/ASME Transactions on Mechatronics 11(2).
@@ -80,11 +80,11 @@ class _Detector(SlipModel):
         smoothing: time constant of the smoothing [s].
         quantile: quantile of signals in steps without slip that sets the thresholds.
         limits: fitted thresholds.
-        slip: fitted share of the encoders' twist that is subtracted where slip is flagged.
+        slip: fitted fraction of the encoders' twist that is subtracted where slip is flagged.
     """
 
     threshold: ClassVar[float]
-    """Score from which slip is flagged."""
+    """Smallest score at which slip is flagged."""
     needs: frozenset[Channel] = field(default=_CURRENT, kw_only=True)
     smoothing: float = 0.3
     quantile: float = 0.95

@@ -76,7 +76,7 @@ class Sugeno:
 SLIP_THRESHOLD = 0.2
 """Difference of true and encoders' twist, relative to the latter, above which a window slips."""
 _REST = 0.01
-"""Speed of the fastest rim up to which a robot counts as at rest [m/s]."""
+"""Largest speed of the fastest rim at which a robot counts as at rest [m/s]."""
 _DRIVING = 0.3
 """Smallest rim speed, relative to the fastest wheel's, at which a wheel counts as driving."""
 
@@ -129,14 +129,14 @@ class SlipThresholds:
         change: a_max, acceleration of a wheel [rad/s^2].
         turning: g_th, difference of the yaw rates from encoders and gyro [rad/s]; infinite if a
             training run has no gyro.
-        usual: I_lo, median of the smallest current of the driving wheels [A].
-        highest: I_hi, upper quantile of the smallest current of the driving wheels [A].
+        current_low: I_lo, median of the smallest current of the driving wheels [A].
+        current_high: I_hi, upper quantile of the smallest current of the driving wheels [A].
     """
 
     change: float = 1.0
     turning: float = 1.0
-    usual: float = 0.0
-    highest: float = 1.0
+    current_low: float = 0.0
+    current_high: float = 1.0
 
     @classmethod
     def of(cls, examples: "Sequence[LabelledRun]", quantile: float) -> "SlipThresholds":
@@ -149,7 +149,7 @@ class SlipThresholds:
             return float(np.quantile(firm, at) if len(firm) else signal.min())
 
         amps = np.concatenate([one.amps for one in signals])
-        usual = limit(amps, 0.5)
+        low = limit(amps, 0.5)
         with_gyro = [one.turning for one in signals if one.turning is not None]
         turning = np.inf
         if len(with_gyro) == len(signals):
@@ -157,8 +157,8 @@ class SlipThresholds:
         return cls(
             change=max(limit(np.concatenate([one.change for one in signals]), quantile), 1e-3),
             turning=turning,
-            usual=usual,
-            highest=max(limit(amps, quantile), usual + 1e-3),
+            current_low=low,
+            current_high=max(limit(amps, quantile), low + 1e-3),
         )
 
     def indicators(self, signals: SmoothedSignals) -> tuple[Numbers, Numbers, Numbers | None]:
@@ -167,7 +167,7 @@ class SlipThresholds:
         GI is None without a gyro.
         """
         encoder = np.maximum(signals.deviation, signals.change / self.change)
-        current = (signals.amps - self.usual) / (self.highest - self.usual)
+        current = (signals.amps - self.current_low) / (self.current_high - self.current_low)
         if signals.turning is None or not np.isfinite(self.turning):
             return encoder, current, None
         return encoder, current, signals.turning / self.turning

@@ -199,7 +199,7 @@ def fitted_noise(windows: PosedWindows, dynamics: Dynamics, mass: float) -> Filt
 
 
 def with_gyro(noise: FilterNoise, windows: PosedWindows) -> FilterNoise:
-    """Return `noise` with stds of the gyro and its bias filled in, if there is a gyro."""
+    """Return `noise` with the stds of the gyro and of its bias added, if there is a gyro."""
     known = np.isfinite(windows.gyro)
     if not known.any():
         return noise
@@ -211,7 +211,7 @@ def with_gyro(noise: FilterNoise, windows: PosedWindows) -> FilterNoise:
 
 
 def with_currents(noise: FilterNoise, windows: PosedWindows, force: Drives) -> FilterNoise:
-    """Return `noise` with scale k, offset f and std of forces from currents filled in, if any.
+    """Return `noise` with scale k, offset f and std of forces from currents, if there are currents.
 
     `force` has the modelled force of each drive along its motion [N].
     """
@@ -225,7 +225,7 @@ def with_currents(noise: FilterNoise, windows: PosedWindows, force: Drives) -> F
     residual = np.where(known, windows.force - offset - gain * force, 0.0)
     at = np.unique(windows.run, return_index=True)[1]
     sums, counts = np.add.reduceat(residual, at), np.add.reduceat(known.astype(float), at)
-    # variance of a white noise that would give the residuals' variance of a run's mean
+    # white noise of this variance gives a run's mean the same variance as the residuals
     variance = float((sums**2).sum() / counts.sum())
     return replace(noise, gain=gain, offset=offset, force=max(variance**0.5, 1e-6))
 

@@ -38,7 +38,7 @@ class ForceLaw:
 
     Attributes:
         grip: C1, traction coefficient of a wheel that slides fast [1].
-        rise: A, how fast traction rises with the sliding speed [s/m].
+        rise: A, rate at which traction approaches C1 with the sliding speed [s/m].
         viscous: C2, increase of traction per sliding speed [s/m].
         rolling: rho, coefficient of resistance to travel [1].
         turning: rho_t, coefficient of resistance to turning [1].

@@ -20,7 +20,7 @@ Row = Float[np.ndarray, "run 8"]
 
 @dataclass(frozen=True)
 class FilterNoise:
-    """Noise of the process and of the measurements, from the residuals of the law.
+    """Noise of the process and of the measurements, from the residuals of the force law.
 
     Attributes:
         rolling: standard deviation of rho between runs.
@@ -95,7 +95,7 @@ class SlipFilter:
         noise: fitted noise.
         mass: mass of the robot [kg].
         uses_current: True if forces from currents are used as measurements.
-        wander: standard deviation of the random walk of rho after one second.
+        wander: standard deviation of the random walk of rho after one second [1].
     """
 
     dynamics: Dynamics

@@ -73,7 +73,7 @@ def test_the_smallest_current_is_that_of_the_wheels_that_drive():
 def test_indicators_are_signals_over_their_limits():
     run = patchy(0, gyro=True)
     signals = SmoothedSignals.of(run.signals, ROBOTINO, 1e-3)
-    limits = SlipThresholds(change=2.0, turning=0.06, usual=0.4, highest=0.8)
+    limits = SlipThresholds(change=2.0, turning=0.06, current_low=0.4, current_high=0.8)
     encoder, current, gyro = limits.indicators(signals)
     assert run.signals.current is not None
     fastest = np.abs(run.signals.speed).max(axis=1, keepdims=True)
@@ -95,8 +95,8 @@ def test_limits_are_quantiles_of_the_steps_that_do_not_slip():
     firm = ~np.concatenate([slipping(run) for run in runs])
     signals = [SmoothedSignals.of(run.signals, ROBOTINO, 0.3) for run in runs]
     amps = np.concatenate([s.amps for s in signals])[firm]
-    assert limits.usual == pytest.approx(np.median(amps))
-    assert limits.highest == pytest.approx(np.quantile(amps, 0.9))
+    assert limits.current_low == pytest.approx(np.median(amps))
+    assert limits.current_high == pytest.approx(np.quantile(amps, 0.9))
     turning = np.concatenate([s.turning for s in signals if s.turning is not None])[firm]
     assert limits.turning == pytest.approx(np.quantile(turning, 0.9))
     change = np.concatenate([s.change for s in signals])[firm]
