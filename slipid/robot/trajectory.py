@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-STEP = 0.02
+ROW_PERIOD = 0.02
 """Time between two rows of a path [s]."""
 FULL_SPEED_M, WAIT_M = 0.02, 0.12
 """Distances of the robot from its reference below which a path keeps its speed, and above which it
@@ -21,7 +21,7 @@ class Path(eqx.Module):
     """Pose and twist in the world over the time of the path, which waits for a robot that lags.
 
     Attributes:
-        rows: x, y [m], heading [rad] and their rates [m/s, m/s, rad/s], one row every `STEP`.
+        rows: x, y [m], heading [rad] and their rates [m/s, m/s, rad/s], one row every `ROW_PERIOD`.
         marks: times at which a side (including the rest at its end) or a quarter of a curve ends
             [s].
         corners: reference positions at these times (mark, 2) [m].
@@ -34,11 +34,11 @@ class Path(eqx.Module):
     @property
     def duration(self) -> float:
         """Duration of the path, in the time of the path [s]."""
-        return (len(self.rows) - 1) * STEP
+        return (len(self.rows) - 1) * ROW_PERIOD
 
     def at(self, time: Float[Array, ""] | float) -> Float[Array, "6"]:
         """Return pose and rates at a time of the path [s]; outside it, those of the nearer end."""
-        place = jnp.clip(jnp.asarray(time) / STEP, 0.0, len(self.rows) - 1.000001)
+        place = jnp.clip(jnp.asarray(time) / ROW_PERIOD, 0.0, len(self.rows) - 1.000001)
         low = jnp.floor(place).astype(jnp.int32)
         high, part = jnp.minimum(low + 1, len(self.rows) - 1), place - low
         return (1 - part) * self.rows[low] + part * self.rows[high]
@@ -46,7 +46,7 @@ class Path(eqx.Module):
     def remaining(self, time: Float[Array, ""] | float) -> Float[Array, ""]:
         """Return the path length that remains at a time of the path [m]."""
         steps = jnp.diff(self.rows[:, :2], axis=0)
-        after = jnp.clip(jnp.arange(1, len(self.rows)) - jnp.asarray(time) / STEP, 0.0, 1.0)
+        after = jnp.clip(jnp.arange(1, len(self.rows)) - jnp.asarray(time) / ROW_PERIOD, 0.0, 1.0)
         return jnp.sum(after * jnp.sqrt(jnp.sum(steps**2, axis=1)))
 
     def follow(
@@ -92,9 +92,9 @@ class Path(eqx.Module):
 
     def after_rest(self, seconds: float) -> "Path":
         """Return the path preceded by a rest of this duration at its start."""
-        count, rows = round(seconds / STEP), np.asarray(self.rows)
+        count, rows = round(seconds / ROW_PERIOD), np.asarray(self.rows)
         still = np.tile(rows[0] * [1, 1, 1, 0, 0, 0], (count, 1))
-        marks = jnp.asarray(np.asarray(self.marks) + count * STEP)
+        marks = jnp.asarray(np.asarray(self.marks) + count * ROW_PERIOD)
         return Path(jnp.asarray(np.concatenate([still, rows])), marks, self.corners)
 
 
@@ -132,7 +132,7 @@ def waypoints(
         distance, rate = _trapezoid(length, speed, acceleration, pause)
         line = np.array([*(b - a), turn]) / length
         parts.append(np.hstack([[*a, k * turn] + distance[:, None] * line, rate[:, None] * line]))
-        time += len(distance) * STEP
+        time += len(distance) * ROW_PERIOD
         marks.append(time)
     rows = np.concatenate(parts)
     return Path(jnp.asarray(rows), jnp.asarray(marks), jnp.asarray(p[1:]))
@@ -184,7 +184,7 @@ def curve(
     quarters = np.searchsorted(distance, length[-1] * np.array([0.25, 0.5, 0.75]))
     at = np.append(quarters, len(distance) - 1)
     rows = np.hstack([place, still, rate[:, None] * slope, still])
-    return Path(jnp.asarray(rows), jnp.asarray(at * STEP), jnp.asarray(place[at]))
+    return Path(jnp.asarray(rows), jnp.asarray(at * ROW_PERIOD), jnp.asarray(place[at]))
 
 
 def circle(radius: float = 0.35, speed: float = 0.2) -> Path:
@@ -227,14 +227,14 @@ def _positive(speed: float, acceleration: float) -> None:
 def _trapezoid(
     length: float, speed: float, acceleration: float, pause: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance [m] and speed [m/s] every `STEP` on a straight line with a rest at its end.
+    """Return distance [m] and speed [m/s] over time on a straight line with a rest at its end.
 
     Rows are `ROW_PERIOD` apart. The speed rises, stays constant and falls (trapezoidal profile).
     """
     top = min(speed, float(np.sqrt(length * acceleration)))
     ramp = top / acceleration
     whole = length / top + ramp
-    t = np.arange(1, int(np.ceil((whole + pause) / STEP)) + 1) * STEP
+    t = np.arange(1, int(np.ceil((whole + pause) / ROW_PERIOD)) + 1) * ROW_PERIOD
     up, down = np.minimum(t, ramp), np.clip(t - (whole - ramp), 0.0, ramp)
     level = np.clip(t - ramp, 0.0, whole - 2 * ramp)
     distance = 0.5 * acceleration * up**2 + top * level + top * down - 0.5 * acceleration * down**2

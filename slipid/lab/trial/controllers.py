@@ -14,7 +14,7 @@ from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.controller import Gains, Law, Limits
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.trajectory import STEP, rectangle
+from slipid.robot.trajectory import ROW_PERIOD, rectangle
 from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
 
@@ -45,7 +45,7 @@ def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     """
     path, actuators = rectangle(), ActuatorModel()
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
-    own = STEP * np.arange(len(rows))
+    own = ROW_PERIOD * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
     task = TuningTask(
         reference, np.array(TUNING_STARTS), actuators.command_weights(), actuators.lag_gain, PERIOD
