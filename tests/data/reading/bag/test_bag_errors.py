@@ -138,7 +138,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
         (
             "gyro",
             {"topic": "/imu", "field": "angular_velocity.z[2]"},
-            ("no numbers in angular_velocity.z[2]", "given index"),
+            ("no numbers in angular_velocity.z[2]", "requested index"),
         ),
         (
             "gyro",
