@@ -1,4 +1,4 @@
-"""Record of a robot: its numbers, and quantities computed once from the model.
+"""Record of a robot: its parameters, and quantities computed once from the model.
 
 The effect table of robot.json follows from the effects that fitted runs share. As in forecasts
 (`slipid.fitting.shared_effects`), the motion along, across and in yaw, per metre that the wheels

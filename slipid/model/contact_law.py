@@ -68,7 +68,8 @@ positive = partial(parameter, lower=0.0)
 class ContactSurface(eqx.Module):
     """Parameters of a floor under rolling wheels; leaves may be stacked, one row per label.
 
-    In the force balance leaves are numbers, or one per wheel where wheels stand on several floors.
+    In the force balance a leaf is a single number, or an array (wheel,) if wheels are on several
+    floors.
 
     Attributes:
         labels: names of the stacked surfaces.

@@ -25,7 +25,7 @@ from slipid.robot.trajectory import Path
 PERIOD = 0.05
 """Time between two commands [s]."""
 LONGEST = 2.0
-"""Multiple of the path's duration after which, with 10 s added, a run is stopped [1]."""
+"""Longest run, as a multiple of the path's duration, to which 10 s are added [1]."""
 
 
 class ControlLoopState(eqx.Module, Generic[State]):

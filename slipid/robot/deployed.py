@@ -27,7 +27,7 @@ class RobotArrays(Drives):
     """Arrays of an identified robot with one load set-up, as estimators and controllers hold them.
 
     Compiled code depends only on the static fields, which describe the robot's structure, so robots
-    of equal structure share it whatever their numbers. A drive is a motor with its encoder and
+    of equal structure share it, with any parameters. A drive is a motor with its encoder and
     ammeter. There is one for every wheel unless a motor drives several wheels.
 
     Attributes:
@@ -106,7 +106,7 @@ class DeployedRobot(RobotArrays):
     """An identified robot ready for deployment: the content of robot.json for one load set-up.
 
     Attributes:
-        record: every number with its interval, verdict and provenance.
+        record: every parameter with its interval, verdict and provenance.
         load_setup: name of the load set-up.
     """
 
@@ -128,7 +128,7 @@ class DeployedRobot(RobotArrays):
         """Return the robot of a record with a load set-up, the first one by default.
 
         Raises:
-            ValueError: there is no such load set-up, or a number is missing or out of its bounds.
+            ValueError: there is no such load set-up, or a parameter is missing or out of bounds.
         """
         check_record(record)
         return _arrays(record, load, {path: n.value for path, n in record.parameters.items()})

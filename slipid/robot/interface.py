@@ -121,7 +121,7 @@ class Measurement(eqx.Module):
         wheel_angle: cumulative angle of every encoder, scaled to turns of the wheel [rad]; it takes
             precedence over `wheel_speed`.
         wheel_speed: rate of change of that angle [rad/s].
-        current: current of every motor [A], signed or unsigned as the estimator's settings say.
+        current: current of every motor [A], with or without sign according to the settings.
         voltage: voltage of every motor [V].
         gyro: yaw rate [rad/s].
         fix: pose from another source such as a camera: x, y [m], heading [rad].

@@ -1,6 +1,6 @@
-"""An identified robot as plain values: every number with its uncertainty and its origin.
+"""An identified robot as plain values: every parameter with its uncertainty and its origin.
 
-Field names are the keys of robot.json. Units of fields are listed in `UNITS`; each number in
+Field names are the keys of robot.json. Units of fields are listed in `UNITS`; each parameter in
 `RobotRecord.parameters` has its own field `unit`.
 """
 
@@ -60,8 +60,8 @@ class RecordedNumber:
     Attributes:
         value: value [unit].
         unit: unit of the value.
-        std: posterior std [unit]; None where the number was fixed.
-        interval90: equal-tailed 90 % interval [unit]; None where the number was fixed.
+        std: posterior std [unit]; None for a fixed parameter.
+        interval90: equal-tailed 90 % interval [unit]; None for a fixed parameter.
         verdict: how well the logs determine it.
         provenance: what determines the value: the logs ("measured"), a prior ("borrowed") or an
             explicit choice ("override").
@@ -132,7 +132,7 @@ class EffectRecord:
     Attributes:
         speeds: speeds of the rows, rising.
         mean: estimated effect, to be added to the motion that the model predicts.
-        left: remaining std, which includes the uncertainty of the robot's numbers.
+        left: remaining std, which includes the uncertainty of the robot's parameters.
     """
 
     speeds: tuple[float, ...]
@@ -253,7 +253,7 @@ class RobotRecord:
     """Content of robot.json. Two records with the same content are equal.
 
     Attributes:
-        source: method that the numbers come from.
+        source: method that the parameters come from.
         wheels: shape of the robot.
         parameters: numbers of the robot by path, such as `robot.mass`.
         floors: floors in the order of the arrays.
@@ -263,10 +263,10 @@ class RobotRecord:
         sensors: sensors of the logs.
         alike: drop in log probability for each further floor under the robot; lower where the fit
             used runs over several floors.
-        messages: messages for readers of the numbers.
-        data: hash of the runs; None where the numbers were given.
+        messages: messages for users of the parameters.
+        data: hash of the runs; None if the parameters were given, not fitted.
         versions: versions of the software that computed them.
-        draws: posterior draws of the fitted numbers, by path.
+        draws: posterior draws of the fitted parameters, keyed by path.
         gains: tuned gains; None where there are none.
     """
 
@@ -287,7 +287,7 @@ class RobotRecord:
 
     @cached_property
     def numbers(self) -> str:
-        """Hash of the robot's numbers; it does not depend on gains, versions and messages."""
+        """Hash of the robot's parameters; it does not depend on gains, versions and messages."""
         return checksum(asdict(replace(self, gains=None, versions={}, messages=())))
 
     @cached_property

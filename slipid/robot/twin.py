@@ -131,7 +131,7 @@ class Twin(eqx.Module):
     """A robot on a floor map, simulated by its own identified model.
 
     Attributes:
-        robot: robot with its true numbers.
+        robot: robot with its true parameters.
         floor: map of the surfaces, numbered as in `robot.labels`.
         actuators: response of the wheels and noise of the sensors.
     """

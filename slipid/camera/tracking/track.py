@@ -193,7 +193,7 @@ ODD_SQUARES = 25.0
 """Mean squared residual of a frame, relative to the median over frames, above which its corners do
 not have the shape of a marker [1]."""
 ODD_LEAST = 1.0
-"""Root mean square residual of a frame below which its corners are accepted whatever the median is
+"""Root mean square residual of a frame below which its corners are accepted for any median
 [pixel]. Residuals vary with heading, since an edge along the pixels' rows is located better than a
 slanted one."""
 ODD_SIZE = 0.05

@@ -56,8 +56,8 @@ RULES: dict[str, Rule] = {
 }
 """Rules that turn a primitive of JAX into C, keyed by the primitive's name.
 
-Primitives in `MOVES`, which only move numbers, have no rule here: they are applied at export to the
-indices of the elements, which shows where each element of the result comes from."""
+Primitives in `MOVES`, which only move elements, have no rule here: they are applied at export to
+the indices of the elements, which shows where each element of the result comes from."""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
 """Primitives that call another traced function, whose statements are inlined."""
 

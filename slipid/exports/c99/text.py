@@ -19,7 +19,7 @@ class Usage:
     """Liveness analysis: which statements and arrays of a builder are used, and when.
 
     The code is scanned backwards from its end, since a statement is needed if a later one uses its
-    result. Steps are therefore counted downwards, so that an earlier step has a smaller number.
+    result. Steps are therefore counted downwards, so that an earlier step has a smaller index.
 
     Attributes:
         live: `id` of each statement that is needed.

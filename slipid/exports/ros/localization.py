@@ -42,7 +42,7 @@ PERIOD_S = 0.02
 UNKNOWN = 1e6
 """Variance of height [m^2], roll and pitch [rad^2], which wheels do not measure."""
 DIRECTIONS = 24
-"""Number of directions of travel over which the mean square slip is taken."""
+"""Number of directions of travel over which the squared slip is averaged."""
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def comment(lines: Sequence[str]) -> list[str]:
 def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
     """Return the lines of a parameter file for some nodes, each a name with its parameters.
 
-    Parameters of a group must stand together.
+    Parameters of a group must follow one another.
     """
     lines: list[str] = []
     for node, parameters in parts:

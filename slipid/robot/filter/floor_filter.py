@@ -280,7 +280,7 @@ class FloorFilter(eqx.Module):
     def _stiction(self, w: Array) -> Array:
         """Return the variance of the current of a wheel at rest [A^2]; it is 0 for a turning one.
 
-        Static friction lets the current lie anywhere between two bounds, taken as uniform.
+        Static friction lets the current lie anywhere between two bounds; it is assumed uniform.
         """
         motor = self.robot.motor
         return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
