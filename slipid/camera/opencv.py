@@ -131,7 +131,7 @@ def read_picture(path: Path) -> np.ndarray:
     except cv2.error:  # OpenCV raises this for too large pictures
         picture = None
     if picture is None:
-        raise DataError(f"{path}: no picture that OpenCV reads; expected PNG, JPEG or the like")
+        raise DataError(f"{path}: not a picture that OpenCV reads; expected PNG, JPEG or the like")
     return np.asarray(picture)
 
 

@@ -6,10 +6,9 @@ the terms that they add to the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 
-or in a control law that replaces it.
-
-with the pose p [m] and heading [rad], their references p_ref and heading_ref, the demanded velocity
-v [m/s] in the body frame and yaw rate W [rad/s], and R, the rotation from world to body axes.
+or in a control law that replaces it. Here the pose is p [m] and heading [rad], their references are
+p_ref and heading_ref, v [m/s] is the demanded velocity in the body frame, W [rad/s] the demanded
+yaw rate, and R(-heading) rotates from world to body axes.
 
 A robot whose wheels turn while its body stands still enters recovery: it alternates between turning
 on the spot and driving, with growing effort. A robot far from its path can get stuck like this

@@ -157,11 +157,11 @@ def _content(path: Path) -> dict[str, object]:
         reason = error.strerror or str(error)
         raise DataError(f"{path}: {reason}; expected what `slipid identify` writes") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: no valid JSON ({error}); {REWRITE_HINT}") from error
+        raise DataError(f"{path}: not valid JSON ({error}); {REWRITE_HINT}") from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if not (isinstance(schema, str) and re.fullmatch(r"slipid\.robot/[1-9][0-9]{0,8}", schema)):
         raise DataError(
-            f"{path}: no robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
+            f"{path}: not a robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
             "that `slipid identify` writes"
         )
     if schema != SCHEMA:

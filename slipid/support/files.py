@@ -84,7 +84,7 @@ def read_json(path: Path, what: str) -> Any:
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; expected {what}") from error
     except ValueError as error:
-        raise DataError(f"{path}: no valid JSON ({error}); expected {what}") from error
+        raise DataError(f"{path}: not valid JSON ({error}); expected {what}") from error
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:

@@ -37,7 +37,7 @@ def text_of(path: Path, what: str = "a config") -> str:
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; expected {what} (TOML file)") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: no UTF-8 text; expected {what} (TOML file)") from error
+        raise DataError(f"{path}: not UTF-8 text; expected {what} (TOML file)") from error
 
 
 def mapping_of(path: Path, text: str) -> Content:
@@ -45,7 +45,7 @@ def mapping_of(path: Path, text: str) -> Content:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise DataError(f"{path}: no valid TOML: {error}") from error
+        raise DataError(f"{path}: not valid TOML: {error}") from error
 
 
 def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:

@@ -118,7 +118,7 @@ def test_other_drives(tmp_path, section, wheels, grips):
         ("std = 0.01", "std = -0.01", ['"camera.lag".prior.std: -0.01', "greater than 0"]),
         ("fixed = 0.001", "fixd = 0.001", ['"surface.*.lead".fixd', "did you mean fixed"]),
         ("fixed = 0.001", "fixed = 0.001, free = true", ['"surface.*.lead": fixed and free']),
-        ("[robot]", "[robot", ["no valid TOML", "line 2"]),
+        ("[robot]", "[robot", ["not valid TOML", "line 2"]),
     ],
 )
 def test_mistakes_are_named_with_key_and_choices(tmp_path, old, new, expected):
@@ -140,7 +140,7 @@ def test_absent_and_unreadable_files(tmp_path):
     with pytest.raises(DataError, match=r"No such file.*expected a config"):
         read_config(tmp_path / "none.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match="no UTF-8 text"):
+    with pytest.raises(DataError, match="not UTF-8 text"):
         read_config(tmp_path / "binary.toml")
 
 

@@ -212,9 +212,9 @@ def test_what_is_no_robot_is_refused(tmp_path):
     assert "irectory" in refused(tmp_path)
     for text in ("", "{", '{"a": NaN}', '{"a": 1, "a": 2}', "[" * 100_000, '{"a": 1e}'):
         path.write_text(text)
-        assert "no valid JSON" in refused(path)
+        assert "not valid JSON" in refused(path)
     path.write_bytes(b"\xff\xfe")
-    assert "no valid JSON" in refused(path)
+    assert "not valid JSON" in refused(path)
     for text in (
         "{}",
         "3",
@@ -223,7 +223,7 @@ def test_what_is_no_robot_is_refused(tmp_path):
         '{"schema": "slipid.robot/x"}',
     ):
         path.write_text(text)
-        assert "no robot of slipid" in refused(path)
+        assert "not a robot of slipid" in refused(path)
 
 
 def test_a_newer_file_asks_for_an_update(path):

@@ -164,7 +164,7 @@ def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
     except cv2.error:
         there = False
     if not there:
-        raise DataError(f"{path}: no picture that OpenCV writes; expected .png or .jpg")
+        raise DataError(f"{path}: not a picture that OpenCV writes; expected .png or .jpg")
     return bytes(data)
 
 

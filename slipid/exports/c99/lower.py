@@ -164,7 +164,7 @@ def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
     scan = ScanParameters.of(params)
     carried, consts = scan.carried, scan.constants
     if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
-        raise NoFormError("a loop that goes through an array")
+        raise NoFormError("a scan over an array")
     body = Builder(builder.names, builder)
     body.turns = CodeBlock(builder, times=scan.turns, bodies=[body])
     begun = values[consts:]

@@ -194,11 +194,11 @@ class RobotBuild:
             raise ValueError(f"{self.mass_kg} kg is less than the wheels weigh; expected more")
         if np.linalg.cond(self.wheel_from_twist * self.wheel_radius_m) > 100:
             raise ValueError(
-                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected them spread"
+                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected angles all around"
             )
         if not self.marker_height_m >= self.wheel_radius_m + 0.08:
             raise ValueError(
-                f"marker_height_m = {self.marker_height_m}; expected it 0.08 above the axes"
+                f"marker_height_m = {self.marker_height_m}; expected 0.08 above the wheel axes"
             )
         for name in self.centres_m:
             if not self.load_share(name).min() > 0.02:

@@ -238,7 +238,7 @@ def test_wrong_times_are_refused(tmp_path, text):
 
 def test_files_that_are_no_times(tmp_path):
     (tmp_path / "t.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match="no CSV text"):
+    with pytest.raises(DataError, match="not CSV text"):
         read_times(tmp_path / "t.csv")
     with pytest.raises(DataError, match="expected times of frames"):
         read_times(tmp_path)

@@ -124,7 +124,7 @@ def test_cameras_that_do_not_fit(made, tmp_path):
     del lens["place_m"]
     (tmp_path / "camera.json").write_text(json.dumps(lens), encoding="utf-8")
     video = made.video("robot", ROBOT)
-    assert "a lens without a floor" in refusal(Made(tmp_path), video, *LONE)
+    assert "a lens without a place above" in refusal(Made(tmp_path), video, *LONE)
     (tmp_path / "camera.json").unlink()
     assert "No such file" in refusal(Made(tmp_path), video, *LONE)
 
