@@ -168,14 +168,14 @@ def limit_command(
     return jnp.clip(out, -limits.wheel_speed, limits.wheel_speed)
 
 
-def _turns(tried: Float[Array, ""]) -> Bool[Array, ""]:
+def _spins(tried: Float[Array, ""]) -> Bool[Array, ""]:
     """Return whether a robot turns on the spot after `tried` seconds of recovery."""
     return (tried > 0) & (jnp.mod(tried, TURN_S + GO_S) < TURN_S)
 
 
 def _recovery_factors(tried: Float[Array, ""]) -> Float[Array, "3"]:
     """Return the factors on the demanded twist after `tried` seconds of recovery."""
-    one = jnp.where(_turns(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
+    one = jnp.where(_spins(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
     return jnp.where(tried > 0, one * (1 + RECOVERY_GROWTH * tried), 1.0)
 
 
@@ -245,7 +245,7 @@ class Controller(eqx.Module):
         gap = ref[:2] - pose[:2]
         safe &= ~old.gave_up
         still, tried = self._recovery(old, e, jnp.where(safe, dt, 0.0))
-        wanted = self._wanted(old, ref, pose, gap)
+        wanted = self._demanded_twist(old, ref, pose, gap)
         # disturbance: estimated twist of the robot, less the twist demanded in the last step
         twist = jnp.where(safe, e.twist, 0.0)
         a = 1 - jnp.exp(-dt / OBSERVE_S)
@@ -278,13 +278,13 @@ class Controller(eqx.Module):
         demand = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
         speed = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
         blocked = e.immobilised | ((demand > STUCK_FROM) & (speed < STUCK_SHARE * demand))
-        since = jnp.where(_turns(old.tried), 0.0, jnp.where(blocked, dt, -dt))
+        since = jnp.where(_spins(old.tried), 0.0, jnp.where(blocked, dt, -dt))
         still = jnp.clip(old.still + since, 0.0, 2 * STUCK_S)
         tries = still > STUCK_S
         still = jnp.where(tries & (old.tried == 0), 2 * STUCK_S, still)
         return still, jnp.where(tries, old.tried + dt, 0.0)
 
-    def _wanted(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
+    def _demanded_twist(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
         """Return the twist that the pose loop or the law demands, within the speed limit.
 
         Units are [m/s, m/s, rad/s].

@@ -263,7 +263,7 @@ class TwinPlant:
 
     def reset(self) -> Readings:
         self._count = 0
-        self._state, reading = _begun(self.twin, self.start, self.key)
+        self._state, reading = _first_step(self.twin, self.start, self.key)
         return reading
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
@@ -279,7 +279,7 @@ class TwinPlant:
 
 
 @eqx.filter_jit
-def _begun(twin: Twin, start: Array, key: Array) -> tuple[TwinState, Readings]:
+def _first_step(twin: Twin, start: Array, key: Array) -> tuple[TwinState, Readings]:
     state = twin.init(start, key)
     return state, twin.first(state, twin.noise(key, 0))
 

@@ -101,7 +101,7 @@ def _results(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
         return _evaluated(equation, values)
     builder.source = source_line(equation) or builder.source
     try:
-        return _ruled(builder, equation, values)
+        return _by_rule(builder, equation, values)
     except NoFormError as error:
         known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
         raise UnsupportedError(
@@ -110,7 +110,7 @@ def _results(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
         ) from error
 
 
-def _ruled(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+def _by_rule(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Value]:
     """Return the results of an equation by the rule of its primitive."""
     primitive, params, name = equation.primitive, Params(equation), equation.primitive.name
     if name == "cond":

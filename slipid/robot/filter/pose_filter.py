@@ -120,8 +120,8 @@ class PoseFilter(eqx.Module):
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
         still = jnp.where(tick.moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         old = replace(old, history=history_after_jump(old, motion, self.robot.frame.base))
-        new = replace(self._grow(old, pose, body, tick), still=still)
-        new = self._rest(self._turns(new, body, gyro, free[2], tick), gyro)
+        new = replace(self._moved(old, pose, body, tick), still=still)
+        new = self._bias_at_rest(self._gyro_update(new, body, gyro, free[2], tick), gyro)
         begun, ended = jnp.concatenate([jnp.zeros(1), new.pose, free[2:]]), new.far[None]
         entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
@@ -181,7 +181,7 @@ class PoseFilter(eqx.Module):
             return free  # so exported code of a robot without delay has no search
         return jnp.where(delay == 0.0, free, nearest(now.history, delay)[4])
 
-    def _turns(
+    def _gyro_update(
         self, now: PoseState, body: _StepMotion, gyro: Array, free: Array, tick: TimeStep
     ) -> PoseState:
         """Return the state corrected by comparing a moving robot's gyro with the contact model.
@@ -211,7 +211,7 @@ class PoseFilter(eqx.Module):
         learns = usable * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
         return _scalar_update(now, look, gap, var, learns)
 
-    def _rest(self, now: PoseState, gyro: Array) -> PoseState:
+    def _bias_at_rest(self, now: PoseState, gyro: Array) -> PoseState:
         """Return the state with the gyro's bias updated while the robot rests.
 
         A reading that differs much from the known bias means that the robot creeps on an edge or is
@@ -224,7 +224,7 @@ class PoseFilter(eqx.Module):
         look, learns = jnp.zeros(len(cov)).at[-1].set(1.0), jnp.broadcast_to(rests, len(cov))
         return _scalar_update(now, look, jnp.where(rests, gap, 0.0), var, learns.astype(float))
 
-    def _grow(self, old: PoseState, pose: Array, body: _StepMotion, tick: TimeStep) -> PoseState:
+    def _moved(self, old: PoseState, pose: Array, body: _StepMotion, tick: TimeStep) -> PoseState:
         """Return the state at the pose after the step, with the covariance propagated to it."""
         f, s, dt = self.robot, self.settings, tick.dt
         world = axes_rotation(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
