@@ -108,7 +108,7 @@ def is_picture(path: Path) -> bool:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """Return the pictures in a folder by name; raise `DataError` if there is none."""
+    """Return the pictures in a folder, sorted by name; raise `DataError` if there is none."""
     if paths := sorted(filter(is_picture, folder.iterdir())):
         return paths
     raise DataError(f"{folder}: no picture; expected {', '.join(SUFFIXES)}")

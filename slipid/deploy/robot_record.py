@@ -79,7 +79,7 @@ def robot_record(
 
 
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
-    """Yield path and draws of every number that varies over draws, except those of the camera."""
+    """Yield path and draws of every parameter that varies over draws, except the camera's."""
     for e in entries(robot):
         leaf = np.asarray(e.whole(draws))
         rows = leaf if e.index is None else leaf[:, e.index]

@@ -178,7 +178,7 @@ class PoseFilter(eqx.Module):
         """Return the yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
         delay = self.settings.gyro_delay_s
         if not isinstance(delay, jax.core.Tracer) and float(delay) == 0.0:
-            return free  # so exported code of a robot without delay has no search
+            return free  # no delay: avoid the search, also in exported code
         return jnp.where(delay == 0.0, free, nearest(now.history, delay)[4])
 
     def _gyro_update(
