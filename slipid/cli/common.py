@@ -22,8 +22,8 @@ def option(
     metavar: str,
     words: str,
     *names: str,
-    min: float | None = None,
-    max: float | None = None,
+    min: float | int | None = None,
+    max: float | int | None = None,
 ) -> OptionInfo:
     """Return an option with a value, for an annotation.
 

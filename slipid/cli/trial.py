@@ -69,6 +69,6 @@ def trial(
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
         done = run(out, options, executor, report)
         report.stage("drawing")
-        trial_plot(done.content, done.paths, done.wanted, done.floor, out / "trial.png")
+        trial_plot(done, out / "trial.png")
     emit(json, done.content, lambda page: show_trial(page, done.content, out))
     return 0

@@ -101,23 +101,18 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
         geometry: declared geometry of the robot.
         mass_kg: mass of the robot [kg], or None if it is unknown.
     """
-    channels = joined(data)
-    found = tuple(_all(channels, edges(channels), geometry, mass_kg, pose_lag(data)))
+    found = tuple(_all(data, geometry, mass_kg))
     if not {finding.kind for finding in found} & {*MADE_REDUNDANT_BY}:
         columns = tuple(misordered(data.logs))
         found = tuple(f for f in found if not columns or f.kind not in CAUSED_BY_ORDER) + columns
     return worst_first(found)
 
 
-def _all(
-    data: JoinedRuns,
-    at: StepEdges,
-    geometry: Geometry,
-    mass_kg: float | None,
-    lag: PoseLag | None,
-) -> Iterator[Finding]:
+def _all(runs: Runs, geometry: Geometry, mass_kg: float | None) -> Iterator[Finding]:
     """Yield all findings but `wheel_columns`, in no particular order."""
-    found = _compared(data, at, geometry, lag)
+    data = joined(runs)
+    at = edges(data)
+    found = _compared(data, at, geometry, pose_lag(runs))
     if found is None:
         yield _not_checked(
             f"the runs are too short: {len(at.run)} steps, {FEWEST_STEPS} are needed"

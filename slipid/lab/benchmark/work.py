@@ -87,7 +87,7 @@ class FoldTask:
         missing = [key for key, one in found.items() if one is None or one["failed"]]
         if missing:
             try:
-                data: FoldData | FoldScore[RunScore] = _fold_data(self)
+                data: FoldData | FoldScore[RunScore] = fold_data(self)
             except Exception as error:  # a task that fails does not stop the others
                 data = FoldScore.of_error(error)
             for protocol, name in missing:
@@ -175,7 +175,7 @@ class FoldData:
         return [run for batch in self.batches for run in batch.runs]
 
 
-def _fold_data(task: FoldTask) -> FoldData:
+def fold_data(task: FoldTask) -> FoldData:
     """Return the runs and slipid's fit of a fold.
 
     Poses are corrected by the camera model that slipid fitted to the training runs, or by that of

@@ -57,13 +57,8 @@ def figure2(field: MotorTable) -> Figure:
     axes = made.subplots()
     axes.plot(points.current, points.slip, ".", color="#56B4E9", ms=3.5, alpha=0.55, zorder=1)
     _medians(axes, points.current, points.slip, drawing.BLUE, "o", "median of 0.15 A bins", 0.15)
-    x = np.array([0.0, 1.55])
-    if field.stored is not None:
-        label = f"paper's SVR: {_formula(field.stored)}, RMSE {field.stored.rmse:.3f}"
-        axes.plot(x, field.stored.slip(x), color=_PAPER, lw=2.5, label=label, zorder=4)
-    ours = field.forms["affine in I"]
-    label = f"least squares: {_formula(ours)}, RMSE {ours.rmse:.3f}"
-    axes.plot(x, ours.slip(x), "--", color=_OURS, lw=2, label=label, zorder=5)
+    _model(axes, field.stored, "paper's SVR", _PAPER, "-", 1.55)
+    _model(axes, field.forms["affine in I"], "least squares", _OURS, "--", 1.55)
     _slip_axes(axes, "current", 2.0)
     axes.legend(loc="lower right", fontsize=9, framealpha=0.95)
     return made
@@ -106,16 +101,9 @@ def figure4(table: MotorTable) -> Figure:
         colour, marker = _SURFACE[surface]
         axes.plot(part.torque, part.slip, marker, color=colour, ms=2.5, alpha=0.35, mec="none")
         axes.plot([], [], marker, color=colour, ms=5, label=f"{surface} ({len(part)})")
-    x = np.linspace(0.0, 0.5, 200)
-    lines = [
-        (table.forms["linear in M"], "paper's linear model", _THIRD, "-."),
-        (table.stored, "paper's quadratic SVR", _PAPER, "-"),
-        (table.forms["quadratic in M"], "least squares", _OURS, "--"),
-    ]
-    for form, name, colour, style in lines:
-        if form is not None:
-            label = f"{name}: {_formula(form)}, RMSE {form.rmse:.3f}"
-            axes.plot(x, form.slip(x), style, color=colour, lw=2.2, label=label)
+    _model(axes, table.forms["linear in M"], "paper's linear model", _THIRD, "-.", 0.5)
+    _model(axes, table.stored, "paper's quadratic SVR", _PAPER, "-", 0.5)
+    _model(axes, table.forms["quadratic in M"], "least squares", _OURS, "--", 0.5)
     _slip_axes(axes, "torque", 0.5)
     axes.legend(loc="lower right", fontsize=8, framealpha=0.95)
     return made
@@ -176,6 +164,16 @@ def _floor(track: SquareTrack) -> np.ndarray:
     """
     step = track.position - track.position[0]
     return np.stack([-step[:, 0], step[:, 1]], axis=1)
+
+
+def _model(
+    axes: Axes, form: FittedForm | None, name: str, colour: str, style: str, limit: float
+) -> None:
+    """Draw a model of slip from 0 to a limit of its regressor, if there is one."""
+    if form is not None:
+        x = np.linspace(0.0, limit, 200)
+        label = f"{name}: {_formula(form)}, RMSE {form.rmse:.3f}"
+        axes.plot(x, form.slip(x), style, color=colour, lw=2.2, label=label, zorder=5)
 
 
 def _medians(

@@ -62,12 +62,12 @@ def selftest(
     task = planned_task(config, report) if data is None else read_fit_task(config, data, report)
     problem = task.problem()
     wanted = wanted_paths(config, problem)
-    test.plausible(config, task.choices, problem)
+    test.plausible(task, problem)
     writable(out)
     report.stage("expected information")
     before = expected(task, problem)
     kept = Checkpoint(out, key_of(config.hash, task.data_hash, seed))
-    rows = test.replicates(config, task.choices, problem, count, seed, kept, report)
+    rows = test.replicates(task, problem, count, seed, kept, report)
     found = {
         "schema": SCHEMA,
         "source": "plan" if data is None else "logs",

@@ -11,6 +11,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import jax
@@ -100,15 +101,14 @@ def heading_grid(
     At each speed [m/s] there are straight runs in `headings` directions, and `turns` curves.
     """
     drives = []
-    for surface, load in setups:
-        for speed in speeds:
-            angles = 2 * np.pi * np.arange(headings) / headings
-            drives += [PlannedRun(surface, load, float(angle), speed) for angle in angles]
-            angles = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
-            drives += [
-                PlannedRun(surface, load, float(angle), speed, turn=(-1) ** k * 4.0 * speed)
-                for k, angle in enumerate(angles)
-            ]
+    for (surface, load), speed in product(setups, speeds):
+        angles = 2 * np.pi * np.arange(headings) / headings
+        drives += [PlannedRun(surface, load, float(angle), speed) for angle in angles]
+        angles = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
+        drives += [
+            PlannedRun(surface, load, float(angle), speed, turn=(-1) ** k * 4.0 * speed)
+            for k, angle in enumerate(angles)
+        ]
     return tuple(drives)
 
 
@@ -122,13 +122,12 @@ def turning_grid(
     radius is the speed.
     """
     drives = []
-    for surface, load in setups:
-        for speed in speeds:
-            for angle in 2 * np.pi * np.arange(count) / count:
-                # rounded, since the computed cosine of a right angle is not exactly zero
-                ahead, turn = (round(speed * float(f(angle)), 9) for f in (np.cos, np.sin))
-                back = 0.0 if ahead >= 0 else np.pi
-                drives.append(PlannedRun(surface, load, back, abs(ahead), turn=turn / base_radius))
+    angles = (2 * np.pi * np.arange(count) / count).tolist()
+    for (surface, load), speed, angle in product(setups, speeds, angles):
+        # rounded, since the computed cosine of a right angle is not exactly zero
+        ahead, turn = (round(speed * float(f(angle)), 9) for f in (np.cos, np.sin))
+        back = 0.0 if ahead >= 0 else np.pi
+        drives.append(PlannedRun(surface, load, back, abs(ahead), turn=turn / base_radius))
     return tuple(drives)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from pydantic import TypeAdapter
 
-from slipid.app.config import Config
+from slipid.app.problem import ConfigFitTask
 from slipid.data.windows import Windows
 from slipid.fitting import likelihood as lk
 from slipid.fitting.noise import SHARED, axes, noise, travel
@@ -200,9 +200,7 @@ class Replicate:
 _FILE = TypeAdapter(list[Replicate])
 
 
-def plausible(
-    config: Config, choices: Sequence[Choice], problem: Problem
-) -> tuple[np.ndarray, np.ndarray]:
+def plausible(task: ConfigFitTask, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and std, in the search space, from which true parameters are drawn.
 
     The mean is that of the prior; for the std see `SCATTER`. A parameter in `[selftest.truth]` has
@@ -212,17 +210,17 @@ def plausible(
         DataError: `[selftest.truth]` names a parameter that does not exist or is fixed, or gives
             a value that the parameter cannot have.
     """
-    space, given = problem.space, config.content.selftest.truth
+    space, config = problem.space, task.config
     center = space.prior_mean.copy()
     scatter = SCATTER * np.minimum(space.prior_std, MOST_PRIOR_STD)
-    for pattern, value in given.items():
+    for pattern, value in config.content.selftest.truth.items():
         where = f"{config.path}: selftest.truth.'{pattern}'"
         mine = [e for e in space.free if fnmatchcase(e.path, pattern)]
         if not mine:
             free = ", ".join(e.path for e in space.free)
             raise DataError(f"{where}: no such free parameter; expected one of {free}")
         try:
-            start = Space(problem.robot, [*choices, Choice(pattern, start=value)]).start
+            start = Space(problem.robot, [*task.choices, Choice(pattern, start=value)]).start
         except ValueError as error:
             raise DataError(f"{where}: {error}") from error
         for e in mine:
@@ -232,29 +230,22 @@ def plausible(
 
 
 def replicates(
-    config: Config,
-    choices: Sequence[Choice],
-    problem: Problem,
-    count: int,
-    seed: int,
-    kept: Checkpoint,
-    report: Reporter,
+    task: ConfigFitTask, problem: Problem, count: int, seed: int, kept: Checkpoint, report: Reporter
 ) -> list[Replicate]:
     """Return `count` replicates; those in the checkpoint are not simulated again.
 
     Args:
-        config: config of the experiment.
-        choices: choices of the problem.
-        problem: fitting problem of the experiment; its compiled functions are used for every
+        task: fit task of the experiment.
+        problem: its fitting problem of the experiment; its compiled functions are used for every
             replicate.
         count: number of replicates.
         seed: seed of true parameters and noise, together with the replicate's number.
         kept: checkpoint with the finished replicates, to which every new one is added.
         report: receives messages about progress.
     """
-    center, scatter = plausible(config, choices, problem)
+    center, scatter = plausible(task, problem)
     std = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
-    fit = config.content.fit
+    fit = task.config.content.fit
     found = _FILE.validate_python(kept.load_json(FILE) or [])[:count]
     if found:
         report.line(f"{len(found)} of {count} replicates are in {kept.folder / FILE}.json already")
@@ -269,7 +260,7 @@ def replicates(
         windows = simulate_windows(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
         this = problem.of(windows)
         end = optimise(this, most_rounds=fit.rounds, tolerance=fit.tolerance, tell=tell)
-        found.append(recovery(this, choices, z, end))
+        found.append(recovery(this, task.choices, z, end))
         kept.save_json(FILE, [asdict(one) for one in found])
         report.advance(len(found), count)
     return found

@@ -6,7 +6,6 @@ runs does not need it.
 
 import os
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -19,6 +18,8 @@ from slipid.lab.testsite.robot_build import mjcf
 from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.support.errors import DataError
 
+Pose = Float[np.ndarray, "3"]
+Angles = Float[np.ndarray, " wheel"]
 MARKER = 0
 """Number of the marker in ArUco's dictionary 4X4_50, as on the Robotino of the published frames."""
 
@@ -100,9 +101,7 @@ class Studio:
         """Release the drawing context."""
         self._renderer.close()
 
-    def frame(
-        self, pose: Float[np.ndarray, "3"], wheel_angle: Float[np.ndarray, " wheel"]
-    ) -> np.ndarray:
+    def frame(self, pose: Pose, wheel_angle: Angles) -> np.ndarray:
         """Return an image of the robot with lens distortion, without blur and noise.
 
         Its shape is (row, column, 3), with blue, green and red.
@@ -115,24 +114,16 @@ class Studio:
         drawn = np.ascontiguousarray(self._renderer.render()[:, :, ::-1])
         return self._cv2.remap(drawn, *self._distortion, self._cv2.INTER_LINEAR)
 
-    def exposed(
-        self,
-        time: float,
-        pose_at: Callable[[float], Float[np.ndarray, "3"]],
-        wheels_at: Callable[[float], Float[np.ndarray, " wheel"]],
-    ) -> np.ndarray:
+    def exposed(self, time: float, at: Callable[[float], tuple[Pose, Angles]]) -> np.ndarray:
         """Return a frame with motion blur, lens blur, flicker and noise.
 
         Args:
             time: middle of the exposure [s].
-            pose_at: function that gives the pose at a time [m, m, rad].
-            wheels_at: function that gives the wheel angles at a time [rad].
+            at: function that gives the pose [m, m, rad] and the wheel angles [rad] at a time.
         """
         c = self.camera
         ends = (-0.5, 0.5) if c.exposure_s > 0 else (0.0,)
-        images = [
-            self.frame(pose_at(t), wheels_at(t)) for t in (time + c.exposure_s * np.array(ends))
-        ]
+        images = [self.frame(*at(t)) for t in (time + c.exposure_s * np.array(ends))]
         image = np.mean(images, axis=0, dtype=np.float32)
         if c.blur_px > 0:
             image = self._cv2.GaussianBlur(image, (0, 0), c.blur_px)
@@ -171,8 +162,10 @@ def film(
 
     c = studio.camera
 
-    def at(name: str, t: float) -> np.ndarray:
-        return interpolate(true["time"], true[name], np.array([t]))[0]
+    def at(t: float) -> tuple[Pose, Angles]:
+        moved = (true[name] for name in ("pose", "wheel_angle"))
+        pose, angle = (interpolate(true["time"], x, np.array([t]))[0] for x in moved)
+        return pose, angle
 
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.partial.avi")
@@ -182,7 +175,7 @@ def film(
         raise DataError(f"{path}: OpenCV cannot write a video there")
     try:
         for t in frames:
-            video.write(studio.exposed(float(t), partial(at, "pose"), partial(at, "wheel_angle")))
+            video.write(studio.exposed(float(t), at))
         video.release()
         written = cv2.VideoCapture(str(unfinished)).get(cv2.CAP_PROP_FRAME_COUNT)
         if written != len(frames):

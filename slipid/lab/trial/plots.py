@@ -1,6 +1,5 @@
 """Figure of a trial: the paths of every controller over the floor, and their errors."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from textwrap import wrap
 
@@ -12,10 +11,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from slipid.data.floor_map import FloorMap
+from slipid.lab.trial.trial import TrialResult
 from slipid.plots.drawing import INK, ORANGE, SERIES, SHADE, figure, plain, save
 from slipid.support.content import Content
 
-Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Colours of surfaces, in the order of the map's surfaces."""
 FAINT = SERIES[4]
@@ -27,21 +26,13 @@ ERRORS = {
 }
 
 
-def trial_plot(
-    content: Content, paths: Paths, wanted: np.ndarray, floor: FloorMap, path: Path
-) -> Path:
-    """Write a figure of a trial and return its file.
+def trial_plot(trial: TrialResult, path: Path) -> Path:
+    """Write a figure of a trial to a file and return the file.
 
     For every controller it shows the paths from all starts, moved to a common start pose, and
     highlights the run from a typical start over the map; bars show medians of errors.
-
-    Args:
-        content: content of trial.json.
-        paths: true poses (step, 3), keyed by name of the run, `CONTROLLER/startNN`.
-        wanted: positions on the reference path (row, 2) [m].
-        floor: map of the floor.
-        path: file of the figure.
     """
+    content = trial.content
     names = list(content["summary"])
     rows = -(-len(names) // 3)
     path_name = f"{content['path'].capitalize()} at {content['speed_m_s']:g} m/s"
@@ -51,8 +42,8 @@ def trial_plot(
     one = _typical_start(content)
     for k, name in enumerate(names):
         axes = drawing.add_subplot(grid[k // 3, k % 3])
-        _paths_panel(axes, name, content, paths, wanted, floor, one)
-    _legend(drawing, floor)
+        _paths_panel(axes, name, trial, one)
+    _legend(drawing, trial.floor)
     for k, (key, label) in enumerate(ERRORS.items()):
         _bars(drawing.add_subplot(grid[rows, k]), content["summary"], key, label)
     return save(drawing, path)
@@ -78,22 +69,15 @@ def _typical_start(content: Content) -> int:
     return int(np.argmin([abs(r["closure_mm"] - middle) for r in runs]))
 
 
-def _paths_panel(
-    axes: Axes,
-    name: str,
-    content: Content,
-    paths: Paths,
-    wanted: np.ndarray,
-    floor: FloorMap,
-    one: int,
-) -> None:
+def _paths_panel(axes: Axes, name: str, trial: TrialResult, one: int) -> None:
     """Draw the paths of a controller from all starts, in the axes of their start poses.
 
     The path from start `one` is highlighted, over the floor as seen from that start.
     """
-    runs = [r for r in content["runs"] if r["controller"] == name]
+    runs = [r for r in trial.content["runs"] if r["controller"] == name]
+    wanted, floor = trial.wanted, trial.floor
     own = [
-        (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _rotation(r["start"][2])
+        (trial.paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _rotation(r["start"][2])
         for k, r in enumerate(runs)
     ]
     (left, low), (right, high) = wanted.min(axis=0) - 0.35, wanted.max(axis=0) + 0.35
@@ -108,11 +92,11 @@ def _paths_panel(
     axes.plot(*wanted.T, "--", color=INK, lw=1.0)
     axes.plot(*own[one].T, color=ORANGE, lw=1.8)
     axes.plot(*own[one][-1], "o", color=ORANGE, ms=5)
-    row = content["summary"][name]
+    row = trial.content["summary"][name]
     closes, off = row["closure_error_median"], row["heading_error_deg"]
     done = f"{100 * row['finished_share']:.0f} % finish"
     title = f"{name}: {closes:.0f} mm, {off:.0f} deg off, {done}"
-    about = "\n".join(wrap(content["controllers"][name], 44))
+    about = "\n".join(wrap(trial.content["controllers"][name], 44))
     axes.set_title(f"{title}\n{about}", fontsize=8, loc="left")
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.tick_params(labelsize=7)

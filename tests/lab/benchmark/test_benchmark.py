@@ -154,14 +154,14 @@ def test_a_split_that_cannot_be_read_fails_alone(tmp_path, monkeypatch):
         raise OSError("disk on fire")
 
     with monkeypatch.context() as patch:
-        patch.setattr(benchmark_work, "_fold_data", broken)
+        patch.setattr(benchmark_work, "fold_data", broken)
         task.run()
     rows = task.rows()
     assert {protocol for protocol, _ in rows} == {"known_floor", "unknown_floor"}
     assert all(row.failed and "disk on fire" in row.absent for row in rows.values())
 
     # what failed is tried again
-    monkeypatch.setattr(benchmark_work, "_fold_data", lambda task: None)
+    monkeypatch.setattr(benchmark_work, "fold_data", lambda task: None)
     monkeypatch.setattr(
         benchmark_work, "_score", lambda data, protocol, name: FoldScore.lacking(["gyro"])
     )

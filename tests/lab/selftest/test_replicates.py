@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import equinox as eqx
 import jax
@@ -254,7 +255,8 @@ def test_a_replicate_depends_on_seed_and_number_alone(tmp_path, monkeypatch):
     truth = robot()
     w = made(truth, std={}, signed=False)
     problem = Problem(w, truth, [])
-    settings = parsed(Path("my.toml"), packaged_config("robotino.toml"))
+    config = parsed(Path("my.toml"), packaged_config("robotino.toml"))
+    task = Mock(spec=ConfigFitTask, config=config, choices=())
     seen = []
     monkeypatch.setattr(
         selftest, "simulate_windows", lambda t, w, rng, std: seen.append(rng.normal()) or w
@@ -269,7 +271,7 @@ def test_a_replicate_depends_on_seed_and_number_alone(tmp_path, monkeypatch):
 
     def run(count, folder, seed=3):
         kept, report = Checkpoint(tmp_path / folder, "key"), Reporter(quiet=True)
-        return selftest.replicates(settings, (), problem, count, seed, kept, report)
+        return selftest.replicates(task, problem, count, seed, kept, report)
 
     whole = run(4, "whole")
     assert run(2, "left") == whole[:2]

@@ -1,7 +1,7 @@
 """Physics of the virtual test site that holds for any contact law."""
 
 from dataclasses import replace
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import mujoco
 import numpy as np
@@ -364,7 +364,7 @@ def test_the_plans_have_the_runs_of_the_published_logs():
 
 def test_a_timed_program_ends():
     program = TimedTwists((((0.1, 0.0, 0.0), 1.0), ((0.0, 0.0, 0.2), 0.5)))
-    plant = SimpleNamespace(time=0.5)
+    plant = Mock(spec=SimulatedRobot, time=0.5)
     twists = program.twists(plant)
     assert next(twists) == (0.1, 0.0, 0.0)
     plant.time = 1.2

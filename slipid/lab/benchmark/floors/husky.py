@@ -120,24 +120,6 @@ def husky_classifiers() -> list[FloorClassifier]:
     return [slipid, CosineEnergyClassifier(), GaussianClassifier(), *tree_classifiers()]
 
 
-def husky_table(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> ClassifierTable:
-    """Return the table of all classifiers, or of the named ones.
-
-    Args:
-        data: folder with the data sets.
-        quick: one fold, short times and default settings instead of the full evaluation.
-        only: names of rows; all if empty.
-
-    Raises:
-        DataError: the folder's files cannot be read.
-    """
-    runs = read_floor_runs(data / FOLDER, RADIUS)
-    spec = RobotSpec.of(husky().on(["any"]))
-    methods = [method for method in husky_classifiers() if not only or method.name in only]
-    settings = EvaluationSettings.quick() if quick else EvaluationSettings()
-    return classifier_table(methods, runs, spec, ABOUT, settings)
-
-
 class HuskyFloorTask(FloorTask):
     """Task that makes the table of the Husky on five floors without a pose."""
 
@@ -154,4 +136,8 @@ class HuskyFloorTask(FloorTask):
         return hash_of((str(f.relative_to(root)), f.read_text(errors="replace")) for f in files)
 
     def make(self) -> ClassifierTable:
-        return husky_table(self.options.data, self.options.quick, self.options.only)
+        runs, only = read_floor_runs(self.options.data / FOLDER, RADIUS), self.options.only
+        spec = RobotSpec.of(husky().on(["any"]))
+        methods = [method for method in husky_classifiers() if not only or method.name in only]
+        settings = EvaluationSettings.quick() if self.options.quick else EvaluationSettings()
+        return classifier_table(methods, runs, spec, ABOUT, settings)

@@ -13,7 +13,6 @@ from functools import partial
 
 import numpy as np
 
-from slipid.data.runs import Runs
 from slipid.lab.benchmark.floors.protocol import (
     EvaluationSettings,
     FloorTask,
@@ -25,15 +24,8 @@ from slipid.lab.benchmark.floors.protocol import (
 from slipid.lab.benchmark.floors.result import Answer, ClassifierTable
 from slipid.lab.benchmark.protocols import base_of, splits
 from slipid.lab.benchmark.scores import FoldScore
-from slipid.lab.benchmark.slipid_rows import (
-    NAME,
-    FloorKnowledge,
-    SlipidFit,
-    estimator_runs,
-    fit_slipid,
-)
-from slipid.lab.benchmark.steps import RunBatch, in_order, run_batches
-from slipid.lab.benchmark.work import BenchmarkOptions, FoldTask, checkpoint_of, data_of, problem_of
+from slipid.lab.benchmark.slipid_rows import NAME, FloorKnowledge, estimator_runs
+from slipid.lab.benchmark.work import BenchmarkOptions, FoldData, FoldTask, data_of, fold_data
 from slipid.lab.systems.floors.cosine_energy import CosineEnergyClassifier
 from slipid.lab.systems.floors.interface import FloorClassifier, FloorSignals
 from slipid.lab.systems.floors.learned import GaussianClassifier, tree_classifiers
@@ -56,31 +48,22 @@ def robotino_table(options: BenchmarkOptions) -> ClassifierTable:
 
     A fit of slipid to the same runs that is saved in a checkpoint is reused.
     """
-    data, only = data_of(options, SOURCE), options.only
+    data = data_of(options, SOURCE)
     inner = 1 if options.quick else 2
     settings = EvaluationSettings(seconds=SECONDS, inner=inner, first_s=max(SECONDS))
     folds: dict[str, list[FoldScore[Answer]]] = {}
-    runs: list[FloorSignals] = []
+    every: list[FloorSignals] = []
     for split in splits(data.facts, KIND)[: 1 if options.quick else None]:
-        kept = checkpoint_of(FoldTask(options, SOURCE, KIND, split.fold), fit=True)
-        fit = fit_slipid(data.job, problem_of(options, SOURCE), split.training, kept)
-
-        def batches(numbers: np.ndarray, fit: SlipidFit = fit) -> list[RunBatch]:
-            some = data.logged.subset(numbers)
-            return run_batches(some, fit.contact.robot, data.source.poses_per_step)
-
-        training = [floor_signals(run) for run in in_order(batches(split.training))]
-        batch = batches(split.held_out)
-        held_out = [floor_signals(run) for one in batch for run in one.runs]
-        runs += held_out
-        logs = data.logged.subset(split.held_out)
-        work = {NAME: partial(_slipid, fit, batch, logs, held_out)}
+        fold = fold_data(FoldTask(options, SOURCE, KIND, split.fold))
+        training, held_out = ([floor_signals(r) for r in rs] for rs in (fold.training, fold.runs))
+        every += held_out
+        work = {NAME: partial(_slipid, fold, held_out)}
         for method in robotino_classifiers():
             work[method.name] = partial(evaluated, method, training, held_out, data.spec, settings)
         for name, one in work.items():
-            if not only or name in only:
+            if not options.only or name in options.only:
                 folds.setdefault(name, []).append(attempted(one))
-    return table_of(folds, runs, ABOUT, settings, NAME)
+    return table_of(folds, every, ABOUT, settings, NAME)
 
 
 def floor_signals(run: Run) -> FloorSignals:
@@ -102,12 +85,13 @@ def floor_signals(run: Run) -> FloorSignals:
     )
 
 
-def _slipid(
-    fit: SlipidFit, batches: list[RunBatch], data: Runs, runs: list[FloorSignals]
-) -> FoldScore[Answer]:
-    """Return the result of slipid's estimator on held-out runs."""
+def _slipid(fold: FoldData, runs: list[FloorSignals]) -> FoldScore[Answer]:
+    """Return the result of slipid's estimator on the held-out runs of a fold."""
+    fit = fold.fit
+    if isinstance(fit, FoldScore):
+        return FoldScore(absent=fit.absent, failed=True)
     began = time.perf_counter()
-    predicted = estimator_runs(fit, batches, data, FloorKnowledge())
+    predicted = estimator_runs(fit, fold.batches, fold.held_out, FloorKnowledge())
     took = time.perf_counter() - began
     answers: list[Answer] = []
     for run, one in zip(runs, predicted, strict=True):
