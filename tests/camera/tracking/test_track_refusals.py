@@ -63,7 +63,8 @@ def test_region_decides_between_several(made, tmp_path):
     np.testing.assert_allclose(table[["x", "y"]], OTHER.poses(3)[:, :2], atol=1e-3)
     elsewhere = refusal(made, both, *LONE, "--region", "0,0,40,40")
     assert "no marker of any dictionary" in elsewhere
-    assert "--region is outside the picture" in refusal(made, both, *LONE, "--id", 0, "--region=-9,-9,-1,-1")
+    outside = refusal(made, both, *LONE, "--id", 0, "--region=-9,-9,-1,-1")
+    assert "--region is outside the picture" in outside
     assert "expected four whole numbers" in refusal(made, both, *LONE, "--region", "1,2")
 
 
