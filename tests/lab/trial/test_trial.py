@@ -601,9 +601,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
     other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
     assert values(Controller(other).gains) == values(Gains())
     assert "tuned for load set-up far: driving with hand-set gains" in unused_gains(other, False)
-    with pytest.raises(
-        DataError, match=r"another load set-up \(far\), not for as_built; leave out"
-    ):
+    with pytest.raises(DataError, match=r"another load set-up \(far\), not for as_built; omit"):
         check_gains(tmp_path, other)
     with pytest.raises(DataError, match="it has no tuned gains; omit --tuned-gains"):
         check_gains(tmp_path, deployed)
