@@ -16,6 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.parameter import Entry, entries, share_basis
 
+HELD = 1e-4
+"""Std of a prior, in the search space, with which a coordinate counts as fixed."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -109,6 +112,11 @@ class Space(eqx.Module):
         """Return a mask of the coordinates whose number satisfies a condition."""
         count = [e.coordinates for e in self.free]
         return np.repeat(np.array([wanted(e) for e in self.free], bool), count)
+
+    @property
+    def held(self) -> Bool[np.ndarray, " free"]:
+        """Mask of the coordinates that their prior holds at its mean."""
+        return self.prior_std <= HELD
 
     @property
     def electric(self) -> Bool[np.ndarray, " free"]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from slipid.support.jax_setup import one_blas_thread, plain_loops
 
@@ -25,6 +26,8 @@ LONG = (
     *("test_result", "test_trial"),
 )
 """Files that take longest, the longest first."""
+TOGETHER = {"test_cli": "small", "test_crossing": "small", "test_folds": "small"}
+"""Files whose fits have the same structure run in one process: it compiles them once."""
 MANY = 1_000_000
 """Objects that were made since garbage was collected, from which on it is again."""
 MOST_MB = 1300.0
@@ -124,6 +127,19 @@ def pytest_collection_modifyitems(items):
     """Files that take longest come first, so that two workers end together."""
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """A file runs in one process, and so do the files of a group."""
+
+    class GroupScheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            group = "api" if file.startswith("tests/api/") else TOGETHER.get(Path(file).stem)
+            return group or file
+
+    return GroupScheduling(config, log)
 
 
 @pytest.fixture(scope="module", autouse=True)

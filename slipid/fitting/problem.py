@@ -41,13 +41,15 @@ from slipid.fitting.variances import (
     voltage_information,
 )
 from slipid.model.robot import Robot
-from slipid.search_space import Choice, Space
+from slipid.search_space import HELD, Choice, Space
 
 CREEPS = (0.05, 0.4, 1.0)
 """Start values of the creep (slip ratio of full traction) of every floor.
 
 From other values, fits have ended in poor local minima.
 """
+_NEAR_ZERO = 1e-4
+"""Value of a viscous term that cannot be determined."""
 FEW = 200
 """Largest number of segments for which `without_shared_effects` keeps the effects at zero size.
 
@@ -124,6 +126,21 @@ class Problem:
         other = copy.copy(self)
         other.compiled = {}
         other._read(self.windows, multi_floor)
+        return other
+
+    def holding(self, fixed: Sequence[Choice], choices: Sequence[Choice]) -> "Problem":
+        """Return the same problem with some parameters fixed, unless `choices` say otherwise.
+
+        Their priors are so narrow that they cannot move. The search vector keeps its coordinates,
+        so that nothing is compiled anew.
+        """
+        narrow = [
+            Choice(c.pattern, start=c.fixed, prior_mean=c.fixed, prior_std=HELD * c.fixed)
+            for c in fixed
+        ]
+        other = copy.copy(self)
+        other.space = Space(self.robot, [*narrow, *choices])
+        other._read(self.windows, self.multi_floor)
         return other
 
     def _read(self, windows: Windows, multi_floor: MultiFloorRuns | None) -> None:
@@ -383,5 +400,5 @@ def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None
         known = np.asarray(speeds)[np.isfinite(speeds)]
         if len(known) == len(speeds) and known.max() < 1.3 * max(known.min(), 1e-3):
             names = (f"surface.{floor}.{name}" for name in ("slide_viscosity", "roller_viscosity"))
-            out += [Choice(escape(path), fixed=1e-4) for path in names]
+            out += [Choice(escape(path), fixed=_NEAR_ZERO) for path in names]
     return out

@@ -20,7 +20,7 @@ from slipid.predict.predictive import PredictiveModel, force_balance_of
 from slipid.predict.score import setups
 from slipid.predict.slip_models import slip_models
 from slipid.predict.validation import ScoredRun, add_scores, plain_values
-from slipid.search_space import Choice, Space
+from slipid.search_space import Choice
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 
@@ -226,11 +226,8 @@ def problem_of_runs(
 
     `fitted` are the indices of these runs.
     """
-    fixed = [*fixed_viscosities(data, fitted), *choices]
-    if Space(problem.robot, fixed).names == problem.space.names:
-        return problem
-    # on some floor, the fitted runs have one speed only: its viscosities are fixed
-    return Problem(problem.windows, problem.robot, fixed)
+    fixed = fixed_viscosities(data, fitted)
+    return problem.holding(fixed, choices) if fixed else problem
 
 
 def judge(

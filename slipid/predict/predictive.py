@@ -198,9 +198,11 @@ class ForceBalance(PredictiveModel):
     @property
     def numbers(self) -> dict[str, int]:
         out = dict.fromkeys([*self.robot.surfaces.labels, "shared"], 0)
+        held = self.space.held
         for e in self.space.free:
             if not e.declaration.electric and e.part != "camera":
-                out[e.surface or "shared"] += e.coordinates
+                free = int(np.count_nonzero(~held[self.space.slices[e.path]]))
+                out[e.surface or "shared"] += free
         return out
 
     @cached_property
