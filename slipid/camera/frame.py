@@ -77,7 +77,7 @@ def cut_off(source: FrameSource, count: int) -> str | None:
 
 
 def stamp(path: Path) -> tuple[str, int, int]:
-    """Return name, size and date of a file, by which a change of its content is recognised."""
+    """Return name, size and date of a file, which show whether its content has changed."""
     status = path.stat()
     return path.name, status.st_size, status.st_mtime_ns
 

@@ -42,8 +42,8 @@ DRAWS = 64
 def deploy(found: Fit | Posterior) -> DeployedRobot:
     """Return the robot of a fit or of its posterior, with its first load set-up.
 
-    Its numbers are those of `identified.json`. They come from the posterior if there is one, else
-    from the fit's Laplace approximation; `DeployedRobot.record.source` names the method.
+    Its parameters are those of `identified.json`. They come from the posterior if there is one,
+    else from the fit's Laplace approximation; `DeployedRobot.record.source` names the method.
     """
     source: Source
     if isinstance(found, Posterior):
@@ -116,7 +116,7 @@ def _record(
 ) -> RobotRecord:
     """Return the record of a robot.
 
-    `center` is the search vector of its numbers, and `vectors` are posterior draws of it.
+    `center` is the search vector of its parameters, and `vectors` are posterior draws of it.
     """
     return robot_record(
         robot,
@@ -133,7 +133,7 @@ def _record(
 def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
     """Write robot.json into the folder of a fit; return the names of the files written."""
     robot, path = deploy(found), out / ROBOT
-    with suppress(DataError):  # Tuned gains are kept if the numbers of the robot have not changed.
+    with suppress(DataError):  # keep tuned gains if the robot's parameters are unchanged
         before = DeployedRobot.load(path).record if path.is_file() else robot.record
         if before.numbers == robot.record.numbers:
             robot = DeployedRobot.of(replace(robot.record, gains=before.gains))

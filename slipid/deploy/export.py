@@ -65,9 +65,9 @@ class Exported:
     Attributes:
         folder: path of the folder.
         files: names of its files.
-        robot: hash of the robot's numbers.
+        robot: hash of the robot's parameters.
         forms: forms that it contains.
-        warnings: warnings about numbers that are not identified, at a bound or disputed.
+        warnings: warnings about parameters that are not identified, at a bound or disputed.
     """
 
     folder: Path

@@ -1,4 +1,4 @@
-"""Record of a robot: its numbers, and quantities computed once from the model.
+"""Record of a robot: its parameters, and quantities computed once from the model.
 
 The effect table of robot.json follows from the effects that fitted runs share. As in forecasts
 (`slipid.fitting.shared_effects`), the motion along, across and in yaw, per metre that the wheels
@@ -79,7 +79,7 @@ def robot_record(
 
 
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
-    """Yield path and draws of every number that varies over draws, except those of the camera."""
+    """Yield path and draws of every parameter that varies over draws, except the camera's."""
     for e in entries(robot):
         leaf = np.asarray(e.whole(draws))
         rows = leaf if e.index is None else leaf[:, e.index]

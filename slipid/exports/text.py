@@ -87,11 +87,11 @@ def identifiers(labels: Sequence[str], kind: str) -> tuple[str, ...]:
             else f"{kind}_{plain}".strip("_")
         )
         count, first = 2, name
-        while _bare(name) in map(_bare, names):
+        while _without_underscores(name) in map(_without_underscores, names):
             name, count = f"{first}_v{count}", count + 1
         names.append(name)
     return tuple(names)
 
 
-def _bare(name: str) -> str:
+def _without_underscores(name: str) -> str:
     return name.replace("_", "")

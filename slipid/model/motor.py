@@ -17,7 +17,7 @@ It is about the resolution of the speed signal."""
 
 
 held = partial(electric, free=False)
-"""Declaration of an electric number that is fixed unless the user frees it."""
+"""Declaration of an electric parameter that is fixed unless the user frees it."""
 
 
 class Motor(eqx.Module):

@@ -40,7 +40,7 @@ def design_figure(found: Design) -> Figure:
         spare.remove()
     words = "numbers: order of the runs (x3: three times)\nbent or round arrows: runs with a turn"
     left.supxlabel(f"{words}\ngray dots: runs of the fit", fontsize=9, color=drawing.SHADE)
-    _falling(right.subplots(), found.content["runs_saved"]["paper_grid"])
+    _uncertainty_curves(right.subplots(), found.content["runs_saved"]["paper_grid"])
     return made
 
 
@@ -120,7 +120,7 @@ def _colour(d: PlannedRun) -> str:
     return drawing.ORANGE if d.turn > 0 else drawing.GREEN
 
 
-def _falling(ax: Axes, saved: Content) -> None:
+def _uncertainty_curves(ax: Axes, saved: Content) -> None:
     """Draw each curve of the uncertainty over the number of runs, without earlier data."""
     for key, colour, style, label in CURVES:
         curve = saved["curves"][key]

@@ -1,4 +1,4 @@
-"""Picture for checking a floor map: the photograph with outlines of patches, beside the map."""
+"""Figure for checking a floor map: the photograph with outlines of patches, next to the map."""
 
 from pathlib import Path
 from textwrap import shorten
@@ -27,7 +27,7 @@ def floor_plot(
     in_view: Bool[np.ndarray, "row column"],
     path: Path,
 ) -> Path:
-    """Write a picture of the rectified photograph with outlines and names, beside the map.
+    """Write a figure of the rectified photograph with outlines and names, next to the map.
 
     Args:
         vector: the map.

@@ -1,4 +1,4 @@
-"""Figures of uncertainty: posterior draws and profile likelihoods beside Gaussian approximations.
+"""Figures of uncertainty: posterior draws and profile likelihoods, and Gaussian approximations.
 
 The Gaussian approximation of the posterior has the curvature of the loss at the fit.
 """

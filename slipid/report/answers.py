@@ -60,12 +60,12 @@ def _ranking(answer: Content) -> Table:
         made.add_column(Text(name), justify="right", no_wrap=True)
     made.add_column("fit [s]", justify="right", no_wrap=True)
     for model, spent in answer["cost"].items():
-        cells = [_ranked(one["models"][model]) for one in floors.values()]
+        cells = [_ranking_cell(one["models"][model]) for one in floors.values()]
         made.add_row(model, *cells, _numbers(spent["numbers"]), f"{spent['fit_s']:.1f}")
     return made
 
 
-def _ranked(m: Content) -> str:
+def _ranking_cell(m: Content) -> str:
     """Return a table cell about a model on a floor.
 
     It has the log density less the best model's [nats per run], the end-point error [%] and the

@@ -25,7 +25,7 @@ from slipid.robot.trajectory import Path
 PERIOD = 0.05
 """Time between two commands [s]."""
 DURATION_FACTOR = 2.0
-"""Multiple of the path's duration after which, with 10 s added, a run is stopped [1]."""
+"""Longest run, as a multiple of the path's duration, to which 10 s are added [1]."""
 
 
 class ControlLoopState(eqx.Module, Generic[State]):
@@ -49,7 +49,7 @@ class ControlLoopOutput(eqx.Module):
         command: wheel speeds [rad/s].
         estimate: output of the estimator.
         time: time of the path [s].
-        gave_up: True if the robot was stuck and has stopped for good.
+        gave_up: whether the robot was stuck and has stopped for good.
     """
 
     command: Float[Array, " wheel"]
@@ -201,7 +201,7 @@ class PathMetrics:
         energy_j: energy used by the motors [J]; None if the plant does not provide it.
         effort: root mean square change of the commanded wheel speeds per period [rad/s].
         seconds: duration of the run [s].
-        finished: True if the end of the path was reached.
+        finished: whether the end of the path was reached.
     """
 
     along_track_mm: tuple[float, ...]

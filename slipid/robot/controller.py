@@ -6,10 +6,9 @@ differ in the terms that they add to the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 
-or in a control law that replaces it.
-
-with the pose p [m] and heading [rad], their references p_ref and heading_ref, the demanded velocity
-v [m/s] in the body frame and yaw rate W [rad/s], and R, the rotation from world to body axes.
+or in a control law that replaces it. Here the pose is p [m] and heading [rad], their references are
+p_ref and heading_ref, v [m/s] is the demanded velocity in the body frame, W [rad/s] the demanded
+yaw rate, and R(-heading) rotates from world to body axes.
 
 A robot whose wheels turn while its body stands still enters recovery: it alternates between turning
 on the spot and driving, with growing effort. A robot far from its path can get stuck in this way if
@@ -115,7 +114,7 @@ class ControllerState(eqx.Module):
         still: time for which the body has not moved as demanded; it counts down while the body
             moves as demanded [s].
         tried: time since the current recovery began, 0 if there is none [s].
-        begun: True if a command has been computed yet.
+        begun: whether a command has been computed yet.
     """
 
     command: Float[Array, " wheel"]
@@ -128,7 +127,7 @@ class ControllerState(eqx.Module):
 
     @property
     def gave_up(self) -> Bool[Array, ""]:
-        """True if the controller has stopped for good because the robot is stuck."""
+        """Whether the controller has stopped for good because the robot is stuck."""
         return self.tried > RECOVERY_LIMIT_S
 
 
@@ -172,14 +171,14 @@ def limit_command(
     return jnp.clip(out, -limits.wheel_speed, limits.wheel_speed)
 
 
-def _turns(tried: Float[Array, ""]) -> Bool[Array, ""]:
+def _spins(tried: Float[Array, ""]) -> Bool[Array, ""]:
     """Return whether a robot turns on the spot after `tried` seconds of recovery."""
     return (tried > 0) & (jnp.mod(tried, RECOVERY_TURN_S + RECOVERY_DRIVE_S) < RECOVERY_TURN_S)
 
 
 def _recovery_factors(tried: Float[Array, ""]) -> Float[Array, "3"]:
     """Return the factors on the demanded twist after `tried` seconds of recovery."""
-    one = jnp.where(_turns(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
+    one = jnp.where(_spins(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
     return jnp.where(tried > 0, one * (1 + RECOVERY_GROWTH * tried), 1.0)
 
 
@@ -250,7 +249,7 @@ class Controller(eqx.Module):
         gap = ref[:2] - pose[:2]
         safe &= ~old.gave_up
         still, tried = self._recovery(old, e, jnp.where(safe, dt, 0.0))
-        wanted = self._wanted(old, ref, pose, gap)
+        wanted = self._demanded_twist(old, ref, pose, gap)
         # The disturbance is the estimated twist less the twist demanded in the last step.
         twist = jnp.where(safe, e.twist, 0.0)
         a = 1 - jnp.exp(-dt / OBSERVER_S)
@@ -285,13 +284,13 @@ class Controller(eqx.Module):
         demand = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
         speed = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
         blocked = e.immobilised | ((demand > STUCK_LEAST_SPEED) & (speed < STUCK_SHARE * demand))
-        since = jnp.where(_turns(old.tried), 0.0, jnp.where(blocked, dt, -dt))
+        since = jnp.where(_spins(old.tried), 0.0, jnp.where(blocked, dt, -dt))
         still = jnp.clip(old.still + since, 0.0, 2 * STUCK_S)
         tries = still > STUCK_S
         still = jnp.where(tries & (old.tried == 0), 2 * STUCK_S, still)
         return still, jnp.where(tries, old.tried + dt, 0.0)
 
-    def _wanted(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
+    def _demanded_twist(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
         """Return the twist that the pose loop or the law demands, within the speed limit.
 
         Units are [m/s, m/s, rad/s].

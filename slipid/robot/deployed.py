@@ -26,9 +26,9 @@ from slipid.support.errors import DataError
 class RobotArrays(Drives):
     """Arrays of an identified robot with one load set-up, for estimators and controllers.
 
-    Compiled code depends only on the static fields, which describe the structure of the robot, so
-    that robots of equal structure share it even if their numbers differ. A drive is a motor with
-    its encoder and ammeter. Every wheel has one, unless a motor drives several wheels.
+    Compiled code depends only on the static fields, which describe the robot's structure, so robots
+    of equal structure share it, with any parameters. A drive is a motor with its encoder and
+    ammeter. There is one for every wheel unless a motor drives several wheels.
 
     Attributes:
         frame: directions and radii of the wheels.
@@ -106,7 +106,7 @@ class DeployedRobot(RobotArrays):
     """An identified robot ready for deployment: the content of robot.json for one load set-up.
 
     Attributes:
-        record: every number with its interval, verdict and provenance.
+        record: every parameter with its interval, verdict and provenance.
         load_setup: name of the load set-up.
     """
 
@@ -115,7 +115,7 @@ class DeployedRobot(RobotArrays):
 
     @property
     def steers(self) -> bool:
-        """True if the drives can produce any body twist.
+        """Whether its wheels can produce any twist, each of them driven alone.
 
         Other robots have an estimator but no controller, since `slipid.robot.controller` also
         demands sideways motion.
@@ -128,7 +128,7 @@ class DeployedRobot(RobotArrays):
         """Return the robot of a record with a load set-up, the first one by default.
 
         Raises:
-            ValueError: there is no such load set-up, or a number is missing or out of its bounds.
+            ValueError: there is no such load set-up, or a parameter is missing or out of bounds.
         """
         check_record(record)
         return _arrays(record, load, {path: n.value for path, n in record.parameters.items()})

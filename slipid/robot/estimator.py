@@ -80,10 +80,10 @@ class Estimator(AbstractEstimator[EstimatorState]):
         self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
     ) -> EstimatorState:
         """Return the state of a robot at rest at a pose [m, m, rad] with stds [m], [rad]."""
-        return self._begun(as_numbers(pose), as_numbers(std))
+        return self._state_at(as_numbers(pose), as_numbers(std))
 
     @eqx.filter_jit
-    def _begun(self, pose: Float[Array, "3"], std: Float[Array, "2"]) -> EstimatorState:
+    def _state_at(self, pose: Float[Array, "3"], std: Float[Array, "2"]) -> EstimatorState:
         f, s = self.robot, self.settings
         return EstimatorState(
             wheels=WheelState.init(f, s),
@@ -211,10 +211,10 @@ class Odometry(AbstractEstimator[OdometryState]):
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> OdometryState:
         """Return the state of a robot at rest at a pose [m, m, rad]."""
-        return self._begun(as_numbers(pose))
+        return self._state_at(as_numbers(pose))
 
     @eqx.filter_jit
-    def _begun(self, pose: Float[Array, "3"]) -> OdometryState:
+    def _state_at(self, pose: Float[Array, "3"]) -> OdometryState:
         return OdometryState(
             pose=pose,
             wheels=WheelState.init(self.robot, self.settings),

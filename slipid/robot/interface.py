@@ -39,7 +39,7 @@ class Settings(eqx.Module):
     """Settings of an estimator, which are chosen and not identified.
 
     Attributes:
-        current_is_signed: True if the ammeters measure the sign of a current.
+        current_is_signed: whether the ammeters measure the sign of a current.
         forget_s: measurements within this time count as one independent piece of evidence about the
             floors [s].
         filter_s: time constant of the filter of currents [s].
@@ -123,8 +123,7 @@ class Measurement(eqx.Module):
         wheel_angle: cumulative angle of every encoder, scaled to turns of the wheel [rad]; it takes
             precedence over `wheel_speed`.
         wheel_speed: rate of change of that angle [rad/s].
-        current: current of every motor [A], signed or unsigned as declared in the estimator's
-            settings.
+        current: current of every motor [A], with or without sign according to the settings.
         voltage: voltage of every motor [V].
         gyro: yaw rate [rad/s].
         fix: pose from another source such as a camera: x, y [m], heading [rad].
@@ -171,9 +170,9 @@ class StateEstimate(eqx.Module):
         surface_probability: probability of each floor under each wheel, in the order of `labels`;
             the last column is the probability that it is none of them [1].
         covariance: covariance of the pose in the world frame, in products of [m, m, rad].
-        stale: True if readings of a wheel are missing for too long.
-        immobilised: True if the wheels turn while the body stands still.
-        out_of_range: True if speed or currents exceed those of the fitted runs, or the floor is
+        stale: whether readings of a wheel are missing for too long.
+        immobilised: whether the wheels turn while the body stands still.
+        out_of_range: whether speed or currents exceed those of the fitted runs, or the floor is
             unknown.
         labels: names of the floors.
     """
@@ -198,7 +197,7 @@ class StateEstimate(eqx.Module):
 
     @property
     def finite(self) -> Bool[Array, ""]:
-        """True if every number of the estimate is finite."""
+        """Whether every number of the estimate is finite."""
         parts = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self) if x.dtype != bool]
         return jnp.all(jnp.stack(parts))
 

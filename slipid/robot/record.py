@@ -1,6 +1,6 @@
-"""An identified robot as plain values: every number with its uncertainty and its source.
+"""An identified robot as plain values: every parameter with its uncertainty and its origin.
 
-Field names are the keys of robot.json. Units of fields are listed in `UNITS`; each number in
+Field names are the keys of robot.json. Units of fields are listed in `UNITS`; each parameter in
 `RobotRecord.parameters` has its own field `unit`.
 """
 
@@ -60,8 +60,8 @@ class RecordedNumber:
     Attributes:
         value: value [unit].
         unit: unit of the value.
-        std: posterior std [unit]; None if the number was fixed. interval90: equal-tailed 90 %
-            interval [unit]; None where the number was fixed.
+        std: posterior std [unit]; None for a fixed parameter.
+        interval90: equal-tailed 90 % interval [unit]; None for a fixed parameter.
         verdict: verdict on how well the logs determine the value.
         provenance: source of the value: "measured" (the logs), "borrowed" (a prior) or "override"
             (an explicit choice).
@@ -132,8 +132,7 @@ class EffectRecord:
     Attributes:
         speeds: speeds of the rows, rising.
         mean: estimated effect, to be added to the motion that the model predicts.
-        left: std that remains after this correction, including the uncertainty of the robot's
-            numbers.
+        left: remaining std, which includes the uncertainty of the robot's parameters.
     """
 
     speeds: tuple[float, ...]
@@ -226,7 +225,7 @@ class GainsRecord:
     Attributes:
         values: the gains.
         load: load set-up for which they were tuned.
-        gyro: True if the robot had a gyro.
+        gyro: whether the robot had a gyro.
         method: method of the search.
         loss: losses of the gains set by hand and of the tuned gains.
         better_than_hand: fraction of the cases in which the tuned gains win.
@@ -245,7 +244,7 @@ class GainsRecord:
 
     @property
     def is_better(self) -> bool:
-        """True if the tuned gains are used instead of those set by hand."""
+        """Whether the tuned gains are used instead of those set by hand."""
         return self.verdict == "better than by hand"
 
 
@@ -254,7 +253,7 @@ class RobotRecord:
     """Content of robot.json. Two records with the same content are equal.
 
     Attributes:
-        source: method by which the numbers were computed.
+        source: method that the parameters come from.
         wheels: shape of the robot.
         parameters: numbers of the robot by path, such as `robot.mass`.
         floors: floors in the order of the arrays.
@@ -264,10 +263,10 @@ class RobotRecord:
         sensors: sensors of the logs.
         alike: decrease of the log probability for each further floor under the robot; it is smaller
             if the fit used runs over several floors.
-        messages: messages for readers of the numbers.
-        data: hash of the runs; None if the numbers were given.
+        messages: messages for users of the parameters.
+        data: hash of the runs; None if the parameters were given, not fitted.
         versions: versions of the software that computed the numbers.
-        draws: posterior draws of the fitted numbers, by path.
+        draws: posterior draws of the fitted parameters, keyed by path.
         gains: tuned gains; None if there are none.
     """
 
@@ -288,7 +287,7 @@ class RobotRecord:
 
     @cached_property
     def numbers(self) -> str:
-        """Hash of the robot's numbers; it does not depend on gains, versions and messages."""
+        """Hash of the robot's parameters; it does not depend on gains, versions and messages."""
         return checksum(asdict(replace(self, gains=None, versions={}, messages=())))
 
     @cached_property

@@ -161,8 +161,8 @@ def _content(path: Path) -> dict[str, object]:
     schema = content.get("schema") if isinstance(content, dict) else None
     if not (isinstance(schema, str) and re.fullmatch(r"slipid\.robot/[1-9][0-9]{0,8}", schema)):
         raise DataError(
-            f"{path}: not a robot of slipid (its schema is not {SCHEMA}); expected a robot.json "
-            "of `slipid identify`"
+            f"{path}: not a robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
+            "that `slipid identify` writes"
         )
     if schema != SCHEMA:
         newer = int(schema.partition("/")[2]) > int(SCHEMA.partition("/")[2])

@@ -134,7 +134,7 @@ class Twin(eqx.Module):
     """A robot on a floor map, simulated by its own identified model.
 
     Attributes:
-        robot: robot with its true numbers.
+        robot: robot with its true parameters.
         floor: map of the surfaces, numbered as in `robot.labels`.
         actuators: response of the wheels and noise of the sensors.
     """
@@ -266,7 +266,7 @@ class TwinPlant:
 
     def reset(self) -> Readings:
         self._count = 0
-        self._state, reading = _begun(self.twin, self.start, self.key)
+        self._state, reading = _first_step(self.twin, self.start, self.key)
         return reading
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
@@ -282,7 +282,7 @@ class TwinPlant:
 
 
 @eqx.filter_jit
-def _begun(twin: Twin, start: Array, key: Array) -> tuple[TwinState, Readings]:
+def _first_step(twin: Twin, start: Array, key: Array) -> tuple[TwinState, Readings]:
     state = twin.init(start, key)
     return state, twin.first(state, twin.noise(key, 0))
 

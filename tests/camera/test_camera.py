@@ -62,7 +62,7 @@ def test_a_lens_without_a_floor_is_no_overhead_camera(tmp_path):
     path = tmp_path / "lens.json"
     path.write_text(json.dumps(changed(rotation_from_world=None)), encoding="utf-8")
     assert read_camera(path).rotation_from_world is None
-    with pytest.raises(DataError, match="a lens without a floor"):
+    with pytest.raises(DataError, match="a lens without a place above"):
         OverheadCamera.load(path)
 
 

@@ -159,7 +159,7 @@ def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
     fits = [FloorFit(camera_of(lens, pose), pose, points) for pose in poses]
     fits.sort(key=lambda fit: fit.rms_px)
     above = [fit for fit in fits if fit.camera.place[2] > 0 and fit.camera.rotation[2, 2] < 0]
-    # of two poses with similar errors the one above the floor is taken, if its error is acceptable
+    # of two poses with similar errors, choose the one above the floor if its error is acceptable
     if not above or above[0].rms_px > max(TWIN_RATIO * fits[0].rms_px, LEAST_BAD_PX):
         return None
     best, *others = above

@@ -24,7 +24,7 @@ CHECKPOINT_NAME = "sightings"
 KINDS = {"frame": int, "time": float, "repeated": bool, "row": int, "id": int, "corners": float}
 """Number type of each attribute of `Detections`."""
 FIRST_FRAMES = 100
-"""Number of frames after which a message lists the visible markers if none is a tracked one."""
+"""Number of frames without a tracked marker after which a message lists the visible markers."""
 
 
 @dataclass(frozen=True, eq=False)

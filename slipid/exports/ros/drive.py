@@ -23,7 +23,7 @@ from slipid.exports.ros.yaml_text import Parameter
 from slipid.robot.deployed import DeployedRobot
 
 LARGEST_DIFFERENCE = 0.05
-"""Largest difference of kinematics with which a controller is used for a robot.
+"""Largest difference of kinematics at which a controller still fits a robot.
 
 It is the error of a rim speed as a fraction of the body's speed [1], the speed is that of points on
 the base radius if the body turns on the spot."""

@@ -42,7 +42,7 @@ PERIOD_S = 0.02
 UNKNOWN = 1e6
 """Variance of height [m^2], roll and pitch [rad^2], which wheels do not measure."""
 DIRECTIONS = 24
-"""Number of directions of travel over which the mean square slip is taken."""
+"""Number of directions of travel over which the squared slip is averaged."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class OdometryErrors:
         They are (e v)^2 + q^2 v / period at the speed v [m/s].
         """
         e, q = np.asarray(self.constant), np.asarray(self.process)
-        return _level((e * speed) ** 2 + q**2 * speed / period)
+        return _larger_in_plane((e * speed) ** 2 + q**2 * speed / period)
 
     def walk(self, speed: float, distance: float) -> Axes:
         """Return the variances per second of a random walk [m^2/s, m^2/s, rad^2/s].
@@ -92,7 +92,7 @@ class OdometryErrors:
         After the path length d [m] at the speed v [m/s] its std equals the constant error e d, so
         the variance per second is e^2 d v.
         """
-        return _level(np.asarray(self.constant) ** 2 * distance * speed)
+        return _larger_in_plane(np.asarray(self.constant) ** 2 * distance * speed)
 
 
 def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
@@ -137,7 +137,7 @@ def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"
     return jnp.sqrt(jnp.mean(jnp.stack([along, across, slip[..., 2]], axis=-1) ** 2, axis=1))
 
 
-def _level(row: Float[np.ndarray, "3"]) -> Axes:
+def _larger_in_plane(row: Float[np.ndarray, "3"]) -> Axes:
     """Replace the variances along and across by the larger of the two."""
     return axes_of(np.array([row[:2].max(), row[:2].max(), row[2]]))
 

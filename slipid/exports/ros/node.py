@@ -1,4 +1,4 @@
-"""Parameters of a ROS node `slipid`: the robot's numbers, named by their paths in robot.json.
+"""Parameters of a ROS node `slipid`: the robot's parameters, named by their paths in robot.json.
 
 Names of floors and load set-ups are those of `identifiers`. Arrays per wheel are in the order of
 robot.json; matrices are in row-major order.
@@ -24,7 +24,7 @@ NODE = "slipid"
 
 
 def node_parameters(robot: DeployedRobot) -> tuple[Parameter, ...]:
-    """Return all parameters, group by group."""
+    """Return all parameters; those of a group follow one another."""
     return (*_choices(robot), *_numbers(robot), *_shape(robot), *_errors(robot), *_controls(robot))
 
 

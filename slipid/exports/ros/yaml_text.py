@@ -33,7 +33,7 @@ class Parameter:
         about: description in one paragraph; empty if the description of the previous parameter
             includes it.
         checks: validators of the value.
-        read_only: True if it can be set only when the node starts.
+        read_only: whether it can be set only when the node starts.
         per_line: number of array entries per line; 0 for as many as fit.
     """
 
@@ -81,7 +81,7 @@ def comment(lines: Sequence[str]) -> list[str]:
 def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
     """Return the lines of a parameter file for some nodes, each a name with its parameters.
 
-    The parameters of a group must be adjacent.
+    Parameters of a group must follow one another.
     """
     lines: list[str] = []
     for node, parameters in parts:

@@ -125,7 +125,7 @@ SCHEMA = "slipid.paper2021/1"
 
 @dataclass(frozen=True, eq=False)
 class PaperResult:
-    """Numbers of the paper, computed from its data.
+    """Results of the paper, computed from its data.
 
     Attributes:
         field: samples and models of figure 2: motor 1 over the whole site.
@@ -140,7 +140,7 @@ class PaperResult:
     transfer: Content | None
 
     def as_dict(self) -> dict[str, object]:
-        """Return all numbers keyed by name, ready for JSON."""
+        """Return all results, keyed by name, in the form of paper.json."""
         return {
             "schema": SCHEMA,
             "figure2": _table_dict(1, self.field),
@@ -172,7 +172,7 @@ def find_folder(data: Path) -> Path:
 
 
 def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
-    """Compute the numbers of the paper from its data.
+    """Compute the paper's results from its own data.
 
     Args:
         folder: folder of the 2021 data set.

@@ -58,7 +58,7 @@ class Waypoints:
 
         It ends earlier if too much time passes: 10 s and three times the duration without slip.
         """
-        # the way from the start is not among the places: count that from the last place instead
+        # the start is not among the places: the leg from it is replaced by one from the last place
         corners = np.array([self.places[-1], *self.places])
         longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / self.speed
         pose, back = np.zeros(3), np.linalg.pinv(plant.robot.wheel_from_twist)

@@ -197,13 +197,11 @@ class RobotBuild:
             )
         if np.linalg.cond(self.wheel_from_twist * self.wheel_radius_m) > 100:
             raise ValueError(
-                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected wheels on different "
-                "sides"
+                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected angles all around"
             )
         if not self.marker_height_m >= self.wheel_radius_m + 0.08:
             raise ValueError(
-                f"marker_height_m = {self.marker_height_m}; expected at least 0.08 m above the "
-                "wheel axes"
+                f"marker_height_m = {self.marker_height_m}; expected 0.08 above the wheel axes"
             )
         for name in self.centres_m:
             if not self.load_share(name).min() > 0.02:

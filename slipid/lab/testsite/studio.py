@@ -87,7 +87,7 @@ class Studio:
             self._renderer = mujoco.Renderer(self.model, height, width)
         except Exception as error:
             raise _drawing_error(error) from error
-        self._bent = self._lens()
+        self._distortion = self._lens()
         self._light = self._rng.uniform(0, 2 * np.pi, 2)
         size = (camera.height_px + _SHIFT, camera.width_px + _SHIFT, 3)
         self._grain = camera.noise * self._rng.standard_normal(size, np.float32)
@@ -112,7 +112,7 @@ class Studio:
         self._forward(self.model, self.data)
         self._renderer.update_scene(self.data, "overhead")
         drawn = np.ascontiguousarray(self._renderer.render()[:, :, ::-1])
-        return self._cv2.remap(drawn, *self._bent, self._cv2.INTER_LINEAR)
+        return self._cv2.remap(drawn, *self._distortion, self._cv2.INTER_LINEAR)
 
     def exposed(self, time: float, at: Callable[[float], tuple[Pose, Angles]]) -> np.ndarray:
         """Return a frame with motion blur, lens blur, flicker and noise.

@@ -165,20 +165,20 @@ class FloorFilter(eqx.Module):
         # Evidence has less weight while wheels accelerate, since the equilibrium neglects inertia.
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
         weight = weight / (1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2)
-        prior, apart = self._mixed(old, xi, tick, mapped)
+        prior, apart = self._after_floor_changes(old, xi, tick, mapped)
         log = jnp.log(jnp.maximum(prior, 1e-12)) + weight * jnp.append(known_log, unknown_log)
         belief = jax.nn.softmax(log)
         known = belief[:-1] / jnp.maximum(jnp.sum(belief[:-1]), 1e-12)
         middle = known @ xi
         before = prior[:-1] / jnp.maximum(jnp.sum(prior[:-1]), 1e-12)
-        apart, jump = self._moved(apart, known, xi, turn, tick)
+        apart, jump = self._relative_poses(apart, known, xi, turn, tick)
         under = jnp.einsum("c,cwf->wf", known, hypotheses.on.astype(float))
         motion = BodyMotion(
             twist=middle,
             scatter=(xi - middle).T @ (known[:, None] * (xi - middle)),
             rolling=rolling,
             rolled=rolled,
-            left=f.effect * self._left(part, known, under),
+            left=f.effect * self._remaining_std(part, known, under),
             by_friction=self._by_friction(known @ settled, w, under),
             known=known,
             before=before,
@@ -190,7 +190,7 @@ class FloorFilter(eqx.Module):
         expected = old.expected if mapped is None else mapped
         return FloorState(belief, expected, twist=settled, apart=apart), motion
 
-    def _left(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
+    def _remaining_std(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Return the remaining std of every floor's effects as a fraction of the whole std [1].
 
         With wheels on several floors the whole std remains, since the estimates are for all wheels
@@ -281,12 +281,12 @@ class FloorFilter(eqx.Module):
     def _stiction(self, w: Array) -> Array:
         """Return the variance of the current of a wheel at rest [A^2]; it is 0 for a turning one.
 
-        Static friction lets the current lie anywhere between two bounds, taken as uniform.
+        Static friction lets the current lie anywhere between two bounds; it is assumed uniform.
         """
         motor = self.robot.motor
         return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
 
-    def _mixed(
+    def _after_floor_changes(
         self, old: FloorState, xi: Array, tick: TimeStep, mapped: Array | None
     ) -> tuple[Array, Array]:
         """Return probabilities and relative poses after wheels may have changed floors."""
@@ -336,7 +336,7 @@ class FloorFilter(eqx.Module):
         own = p[whole]
         return p.at[whole].set((1 - leaves) * own + to.T @ own)
 
-    def _moved(
+    def _relative_poses(
         self, apart: Array, known: Array, xi: Array, turn: Array, tick: TimeStep
     ) -> tuple[Array, Array]:
         """Return poses of the hypotheses relative to their mean, and the jump of the mean pose.

@@ -48,7 +48,7 @@ class _StepMotion(eqx.Module):
         axes: directions along, across and in yaw, as columns in the body frame.
         slope: derivative of the twist by the nuisance states without the gyro's bias.
         share: expected fraction of the weight on each floor [1].
-        by_gyro: True if a gyro measures the yaw rate.
+        by_gyro: whether a gyro measures the yaw rate.
     """
 
     speed: Float[Array, ""]
@@ -122,8 +122,8 @@ class PoseFilter(eqx.Module):
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
         still = jnp.where(tick.moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         old = replace(old, history=history_after_jump(old, motion, self.robot.frame.base))
-        new = replace(self._grow(old, pose, body, tick), still=still)
-        new = self._rest(self._turns(new, body, gyro, free[2], tick), gyro)
+        new = replace(self._moved(old, pose, body, tick), still=still)
+        new = self._bias_at_rest(self._gyro_update(new, body, gyro, free[2], tick), gyro)
         begun, ended = jnp.concatenate([jnp.zeros(1), new.pose, free[2:]]), new.far[None]
         entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
@@ -180,10 +180,10 @@ class PoseFilter(eqx.Module):
         """Return the yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
         delay = self.settings.gyro_delay_s
         if not isinstance(delay, jax.core.Tracer) and float(delay) == 0.0:
-            return free  # Without a delay, the exported code then contains no search.
+            return free  # no delay: avoid the search, also in exported code
         return jnp.where(delay == 0.0, free, nearest(now.history, delay)[4])
 
-    def _turns(
+    def _gyro_update(
         self, now: PoseState, body: _StepMotion, gyro: Array, free: Array, tick: TimeStep
     ) -> PoseState:
         """Return the state corrected by comparing a moving robot's gyro with the contact model.
@@ -213,7 +213,7 @@ class PoseFilter(eqx.Module):
         learns = usable * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
         return _scalar_update(now, look, gap, var, learns)
 
-    def _rest(self, now: PoseState, gyro: Array) -> PoseState:
+    def _bias_at_rest(self, now: PoseState, gyro: Array) -> PoseState:
         """Return the state with the gyro's bias updated while the robot rests.
 
         A reading that differs much from the known bias does not change the bias: the robot probably
@@ -226,7 +226,7 @@ class PoseFilter(eqx.Module):
         look, learns = jnp.zeros(len(cov)).at[-1].set(1.0), jnp.broadcast_to(rests, len(cov))
         return _scalar_update(now, look, jnp.where(rests, gap, 0.0), var, learns.astype(float))
 
-    def _grow(self, old: PoseState, pose: Array, body: _StepMotion, tick: TimeStep) -> PoseState:
+    def _moved(self, old: PoseState, pose: Array, body: _StepMotion, tick: TimeStep) -> PoseState:
         """Return the state at the pose after the step, with the covariance propagated to it."""
         f, s, dt = self.robot, self.settings, tick.dt
         world = axes_rotation(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))

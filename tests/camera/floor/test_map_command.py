@@ -66,7 +66,7 @@ def test_pictures_and_cameras_that_do_not_fit_are_refused(made, tmp_path):
     with pytest.raises(DataError, match=r"floor\.png: the file is empty"):
         map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     image.write_bytes(b"no picture at all")
-    with pytest.raises(DataError, match="no picture that OpenCV reads"):
+    with pytest.raises(DataError, match="not a picture that OpenCV reads"):
         map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     with pytest.raises(DataError, match="480 x 400 pixels, but the camera was calibrated at 640"):
         mapped(MadeFloor(made.picture, aslant(640), made.truth, None), tmp_path, None)

@@ -272,7 +272,7 @@ def test_what_is_added_to_the_engine_only_takes_energy():
     twists = [[0.0, 0.0, 0.5], [0.2, 0.0, 0.0], *rng.uniform(-0.3, 0.3, (20, 3))]
     for vx, vy, turn in twists:
         plant.data.qvel[:6] = [vx, vy, 0.0, 0.0, 0.0, turn]
-        plant._resist()
+        plant._apply_resistance()
         force = plant.data.qfrc_applied[:6]
         assert force @ plant.data.qvel[:6] < 0
         if vx == vy == 0:

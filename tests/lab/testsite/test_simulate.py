@@ -219,7 +219,7 @@ def test_the_configs_that_ship_are_good(path):
         (("[maps]", "[robot]\ncentres_m = { as_built = [nan, 0] }\n[maps]"), "centre of mass"),
         (
             ("[maps]", "[robot]\nwheel_azimuths_deg = [60, 60, 60]\n[maps]"),
-            "expected wheels on different sides",
+            "expected angles all around",
         ),
         (("step_deg = 180", "step_deg = 1e-9"), "step_deg: 1e-09"),
         (("distance_m = 0.1", "distance_m = inf"), "distance_m: inf"),

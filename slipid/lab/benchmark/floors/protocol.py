@@ -125,7 +125,7 @@ def tuned_classifier(
     """Return the candidate with the highest accuracy in an inner cross-validation.
 
     The accuracy is averaged over all times (`settings.seconds`); the first of equally good
-    candidates is taken.
+    candidates is used.
     """
     fold = folds_of(runs, settings.inner)
 
