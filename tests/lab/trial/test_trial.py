@@ -56,7 +56,7 @@ def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
     np.testing.assert_allclose(corners[:, 3:], 0.0, atol=1e-9)
     # rates are the derivatives of places
     np.testing.assert_allclose(
-        np.gradient(rows[:, :2], reference.STEP, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
+        np.gradient(rows[:, :2], reference.ROW_PERIOD, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
     )
     assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
 
@@ -65,7 +65,7 @@ def test_a_path_too_short_for_its_speed_is_half_acceleration_and_half_braking():
     path = reference.waypoints([(0.0, 0.0), (0.02, 0.0)], speed=0.5, acceleration=0.5, pause=0.1)
     place, rate = np.asarray(path.rows)[:, [0, 3]].T
     assert rate.max() == pytest.approx(0.1, rel=1e-6)  # the root of 0.02 * 0.5
-    assert np.abs(np.diff(rate)).max() <= 0.5 * reference.STEP + 1e-12
+    assert np.abs(np.diff(rate)).max() <= 0.5 * reference.ROW_PERIOD + 1e-12
     np.testing.assert_allclose(np.diff(place)[:-1], (rate[:-1] + rate[1:])[:-1] * 0.01, atol=1e-9)
     np.testing.assert_allclose([place[-1], rate[-1]], [0.02, 0.0], atol=1e-12)
 
@@ -75,7 +75,7 @@ def test_a_path_too_short_for_its_speed_is_half_acceleration_and_half_braking():
 def test_paths_have_the_rates_of_their_places_and_rest_where_they_began(name, speed):
     path = reference.PATHS[name](speed)
     rows = np.asarray(path.rows)
-    rates = np.gradient(rows[:, :3], reference.STEP, axis=0)
+    rates = np.gradient(rows[:, :3], reference.ROW_PERIOD, axis=0)
     np.testing.assert_allclose(rates[5:-5], rows[5:-5, 3:], atol=0.02)
     pace = np.hypot(rows[:, 3], rows[:, 4])
     assert pace.max() == pytest.approx(speed, rel=1e-4)
