@@ -113,7 +113,7 @@ def _clocks(clocks: Mapping[str, Content]) -> str:
     offsets = [clock["offset_s"] for clock in clocks.values()]
     wide = [0.5 * (high - low) for low, high in (c["offset_interval90_s"] for c in clocks.values())]
     rate = max((clock["drift"] for clock in clocks.values()), key=abs)
-    question = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate right?"
+    question = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate correct?"
     by = ", ".join(sorted({clock["told_by"] for clock in clocks.values()}))
     return (
         f"clock of the poses, from the motion ({by}): {min(offsets):+.3f} to {max(offsets):+.3f} s "
