@@ -266,7 +266,7 @@ class RoundInputs(eqx.Module):
     slope: Float[Array, " free"]
 
 
-class Linearised(NamedTuple):
+class LinearisedResiduals(NamedTuple):
     """Whitened residuals of all blocks and of the prior, and their derivative by the step."""
 
     residual: Float[np.ndarray, " row"]
@@ -296,7 +296,9 @@ def levenberg(fixed: RoundInputs, steps: int) -> Search:
     for _ in range(steps + _MOST_REFUSED - 1):
         a = at.jacobian.T @ at.jacobian + np.eye(len(y)) / length
         step = -np.linalg.solve(a, at.jacobian.T @ at.residual)
-        predicted = Linearised(at.residual + at.jacobian @ step, at.jacobian).loss - at.loss
+        predicted = (
+            LinearisedResiduals(at.residual + at.jacobian @ step, at.jacobian).loss - at.loss
+        )
         new = linearised(fixed, y + step)
         if not new.loss - at.loss <= 0.01 * predicted:
             length *= 0.25
@@ -319,12 +321,12 @@ def _at(fixed: RoundInputs, y: Vector) -> Vector:
     return fixed.z + fixed.mask * fixed.prior_std * y
 
 
-def linearised(fixed: RoundInputs, y: Search) -> Linearised:
+def linearised(fixed: RoundInputs, y: Search) -> LinearisedResiduals:
     """Return whitened residuals and their derivative after a step `y` from the start."""
     z = _at(fixed, y)
     given = GivenMotion(np.array(True), fixed.z, fixed.motor_force)
     residual, jacobian, _ = linear_given(fixed.objective, z, fixed.electric, given)
-    return Linearised(*map(np.asarray, _stacked(fixed, residual, jacobian, z)))
+    return LinearisedResiduals(*map(np.asarray, _stacked(fixed, residual, jacobian, z)))
 
 
 @eqx.filter_jit
