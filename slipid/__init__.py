@@ -1,11 +1,11 @@
-"""Identify a wheeled robot's motors, load shares and wheel-floor contact from its own logs.
+"""Identify a wheeled robot's motors, load shares and wheel-floor contact from its logs.
 
 Every name below is loaded at its first use: importing slipid loads and changes nothing.
 """
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # known to type checkers by its name, without loading `typing`
+TYPE_CHECKING = False  # Type checkers recognise this name, without loading `typing`.
 if TYPE_CHECKING:
     from slipid.api.camera import track as track
     from slipid.api.fit import Prior as Prior

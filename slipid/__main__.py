@@ -1,4 +1,4 @@
-"""`python -m slipid` is the command `slipid`."""
+"""Run the command `slipid` by `python -m slipid`."""
 
 from slipid.cli.main import main
 

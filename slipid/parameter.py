@@ -25,26 +25,26 @@ Numbers = Array | np.ndarray
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Declaration:
-    """Unit, bounds and prior of a number, the same wherever it occurs.
+    """Unit, bounds and prior of a number, which are the same for all its occurrences.
 
     Attributes:
-        unit: unit as pint spells it, "1" for a dimensionless number.
+        unit: unit in the notation of pint, "1" for a dimensionless number.
         symbol: symbol in the equations.
-        start: value used when nothing else is known [unit].
-        lower: smallest value; with no `upper` the search space is the logarithm of the value above
+        start: value that is used if nothing else is known [unit].
+        lower: smallest value; without `upper` the search space is the logarithm of the excess over
             it.
-        upper: largest value; with both bounds the search space is the log-odds of the position
-            between them.
-        spread: default std of the prior in the search space: a log-std where the space is
-            logarithmic, in [unit] where there are no bounds.
-        free: whether the number is fitted unless the user says otherwise.
-        shares: whether the numbers of the array are positive and sum to one.
-        deviation: whether the numbers of the array sum to zero and stand for what the model lacks;
-            their common spread is estimated from the data, up to about `spread`.
-        doc: one line for people.
-        electric: whether the number is estimated from currents and voltages given the motion, not
+        upper: largest value; with both bounds the search space is the log-odds of the relative
+            position between them.
+        spread: default std of the prior in the search space: a log-std if the space is logarithmic,
+            in [unit] if there are no bounds.
+        free: True if the number is fitted unless the user says otherwise.
+        shares: True if the numbers of the array are positive and sum to one.
+        deviation: True if the numbers of the array sum to zero and represent effects missing in the
+            model; their common spread is estimated from the data, up to about `spread`.
+        doc: meaning of the number, in one line.
+        electric: True if the number is estimated from currents and voltages given the motion, not
             from the motion.
-        of: what each number of a vector belongs to: a wheel, a drive or an axis.
+        of: object to which each number of a vector belongs: a wheel, a drive or an axis.
     """
 
     unit: str
@@ -62,12 +62,12 @@ class Declaration:
 
     @property
     def logarithmic(self) -> bool:
-        """Whether the search space is logarithmic."""
+        """True if the search space is logarithmic."""
         return math.isinf(self.upper) and not math.isinf(self.lower)
 
     @property
     def constrained(self) -> bool:
-        """Whether the array has one search-space coordinate less than it has numbers."""
+        """True if the array has one search-space coordinate less than it has numbers."""
         return self.shares or self.deviation
 
     def broken_rule(self, x: np.ndarray) -> str | None:
@@ -160,7 +160,7 @@ known = functools.partial(parameter, free=False)
 
 
 def as_numbers(x: Any) -> Array:
-    """Return an array of floating-point numbers; JAX compiles nothing for what is not one yet."""
+    """Return an array of floating-point numbers, converted without compiling a JAX program."""
     if isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and x.dtype.kind == "f"):
         return x
     return jax.device_put(np.asarray(x, float))
@@ -181,8 +181,8 @@ class Entry:
         leaf: attribute names from the root to the array.
         index: position on the array's leading axis, None for the whole array.
         size: number of values.
-        surface, load, session: label the number belongs to, None for a number that all labels
-            share.
+        surface, load, session: label to which the number belongs, None for a number common to all
+            labels.
     """
 
     path: str
@@ -197,7 +197,7 @@ class Entry:
 
     @property
     def part(self) -> str:
-        """Attribute of the root it belongs to: `motor`, `surfaces`, `camera`."""
+        """Attribute of the root to which the number belongs: `motor`, `surfaces`, `camera`."""
         return self.leaf[0]
 
     def whole(self, tree: Any) -> Any:
@@ -223,7 +223,7 @@ class Entry:
 
     @property
     def coordinates(self) -> int:
-        """Number of search-space coordinates it takes when it is free."""
+        """Number of search-space coordinates of the number if it is free."""
         return self.size - 1 if self.declaration.constrained else self.size
 
 

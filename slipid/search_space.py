@@ -28,8 +28,8 @@ class Choice:
         pattern: path, with `*` and `?` as wildcards: `surface.*.creep`.
         start: start value [SI], which is also the value of a number that is not fitted.
         fixed: value at which the number is fixed [SI]; None leaves it free.
-        free: True or False to free or fix the number without giving a value.
-        prior_mean: centre of the prior [SI].
+        free: True to fit the number, False to keep it at its start value.
+        prior_mean: mean of the prior [SI].
         prior_std: std of the prior [SI]; without `prior_mean`, the prior is centred on the declared
             start value.
     """
@@ -98,7 +98,7 @@ class Space(eqx.Module):
         self.pooled = np.concatenate([np.zeros(0, bool), *pooled])
 
     def with_pooled(self, std: float) -> "Space":
-        """Return the same space with prior std `std` for the pooled coordinates."""
+        """Return the same space, but with the prior std `std` for the pooled coordinates."""
         prior_std = np.where(self.pooled, std, self.prior_std)
         return eqx.tree_at(lambda space: space.prior_std, self, prior_std)
 
@@ -223,7 +223,9 @@ def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
         return None
     x = np.asarray(std, float).ravel()
     if x.size not in (1, entry.size) or not (np.isfinite(x) & (x > 0)).all():
-        raise ValueError(f"{entry.path}: prior std {std}; expected 1 or {entry.size} above zero")
+        raise ValueError(
+            f"{entry.path}: prior std {std}; expected 1 or {entry.size} positive numbers"
+        )
     return x
 
 
@@ -231,7 +233,7 @@ def _checked_value(entry: Entry, value: Any) -> np.ndarray:
     """Return a value as an array; `ValueError` if invalid. A scalar applies to all elements."""
     x = np.asarray(value, float)
     if x.size not in (1, entry.size):
-        raise ValueError(f"{entry.path} takes {entry.size} numbers, got {x.size}")
+        raise ValueError(f"{entry.path}: {x.size} values; expected {entry.size}")
     x = np.broadcast_to(x.ravel(), (entry.size,))
     if rule := entry.declaration.broken_rule(x):
         raise ValueError(f"{entry.path} = {value}: expected {rule}")

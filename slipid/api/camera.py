@@ -24,7 +24,7 @@ def track(
 
     With the result `tracked`, `tracked.tracks[0].pose` has x, y [m] and heading [rad] in every
     frame, or NaN in a rejected frame, whose flag gives the reason. `tracked.write(path)` writes the
-    poses to a file that the preset `tracked` reads beside a robot's log.
+    poses to a file that can be read together with a robot's log by the preset `tracked`.
 
     Args:
         video: file of the video, or folder of the pictures.
@@ -42,7 +42,7 @@ def track(
     above = camera if isinstance(camera, OverheadCamera) else OverheadCamera.load(camera)
     source = open_source(str(video), fps, None if times is None else Path(times))
     above.lens.check_size(source.image_px, source.name)
-    # The folder is temporary, since the results are kept in memory and nothing is resumed from it.
+    # The folder is temporary, since the results are kept in memory and no run is resumed from it.
     with TemporaryDirectory() as folder, Reporter(quiet=quiet) as report:
         bodies: tuple[Target, ...]
         if isinstance(marker, LoneMarker):

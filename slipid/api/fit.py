@@ -45,7 +45,7 @@ def fit(
     seed: int = 0,
     quiet: bool = False,
 ) -> Fit:
-    """Fit motors, floors, wheel loads and camera to runs, end to end.
+    """Fit the parameters of motors, floors, wheel loads and camera to runs.
 
     Parameters are named by paths such as `motor.resistance` or `surface.gray.creep`, in which `*`
     stands for any text and `?` for any character. Parameters that are not named keep their declared
@@ -61,12 +61,13 @@ def fit(
             fitted by default.
         image_centre: point x, y in the frame of the poses at which the camera's tilt and distortion
             cause no error [m].
-        windows_per_piece: number of windows in a segment of a run.
+        windows_per_piece: number of neighbouring windows in a segment, which the fit treats as one
+            observation.
         seed: seed of the draws from which the bands of slip curves are computed.
         quiet: True to report no progress.
 
     Raises:
-        DataError: the runs cannot be cut into windows, or columns of wheels are exchanged.
+        DataError: the runs cannot be divided into windows, or columns of wheels are exchanged.
         ValueError: there is no such parameter, or a value is outside its bounds.
 
     Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.fitting`.

@@ -26,7 +26,7 @@ from slipid.support.progress import Reporter
 
 @dataclass(frozen=True, eq=False)
 class DriveResult:
-    """Result of one closed-loop run; `print` shows how well the robot kept to the path.
+    """Result of one closed-loop run; `print` shows the errors of the robot along the path.
 
     Attributes:
         run: path, true and estimated poses, commands and estimates, with a row for each control
@@ -41,15 +41,16 @@ class DriveResult:
 
     @property
     def course(self) -> closed_loop.ClosedLoopRun:
-        """Return `run`, of which this is an older name."""
+        """Older name of `run`."""
         return self.run
 
     def __str__(self) -> str:
         m = self.metrics
-        ended = "ends" if m.finished else "was given up, with the remaining path it ends"
+        ended = "ends" if m.finished else "was given up; with the remaining path, it ends"
         return (
-            f"{ended} {m.closure_mm:.0f} mm from where it should, turned by "
-            f"{m.heading_error_deg:+.1f} deg; {m.cross_track_rmse_mm:.0f} mm beside the path (rms)"
+            f"{ended} {m.closure_mm:.0f} mm from the end of the path, with a heading error of "
+            f"{m.heading_error_deg:+.1f} deg; cross-track error {m.cross_track_rmse_mm:.0f} mm "
+            "(rms)"
         )
 
 
@@ -74,13 +75,13 @@ def drive(
         map: path of a floor map; by default a random map of patches of the robot's floors.
         path: `rectangle`, `circle`, `eight` or `turning`.
         speed: speed along the path [m/s].
-        start: number of one of twenty start poses on the map, from 0.
+        start: index of one of twenty start poses on the map, from 0.
         seed: seed of the sensors' noise.
 
     Raises:
         ValueError: there is no such controller or start, or no controller for the robot's wheels.
-        DataError: there is no such path or map, the speed is beyond those of the fit, or the map
-            has a floor that the robot does not know.
+        DataError: there is no such path or map, the speed is higher than those of the fitted runs,
+            or the map has a floor that was not identified.
     """
     if not robot.steers:
         raise ValueError(NO_CONTROLLER)
@@ -90,7 +91,10 @@ def drive(
     places = starts(20, floor, reference)
     if controller not in ROWS or not 0 <= start < len(places):
         names = ", ".join(ROWS)
-        raise ValueError(f"controller '{controller}' from start {start}; expected {names}; 0 to 19")
+        raise ValueError(
+            f"controller '{controller}' from start {start}; expected one of {names} and a start "
+            "from 0 to 19"
+        )
     row, begin = ROWS[controller], places[start]
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
@@ -125,8 +129,8 @@ def export(
         map: path of a floor map, which the controller `contact_map` needs.
 
     Raises:
-        DataError: there is no such form, controller or path, a step cannot be written in C, or the
-            folder has other files.
+        DataError: there is no such form, controller or path, a step cannot be converted to C, or
+            the folder has other files.
     """
     file = None if map is None else Path(map)
     options = ExportOptions(tuple(to), controller, path, speed, map=file)

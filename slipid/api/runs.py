@@ -26,7 +26,8 @@ class LogCheck:
 
     Attributes:
         content: summary of the runs by floor, of their channels, and of the reader's repairs.
-        result: expected verdict of each parameter, and sentences about what stays unknown.
+        result: expected verdict of each parameter, and sentences about combinations that stay
+            unknown.
     """
 
     content: Content
@@ -90,13 +91,14 @@ def simulate_runs(
     An older name, `made_runs`, still works.
 
     Args:
-        floors: names of the floors; `firm` and `soft` have parameters of their own, other floors
-            have the declared start values.
+        floors: names of the floors; `firm` and `soft` have particular parameters, other floors the
+            declared start values.
         headings: number of evenly spread directions of travel, on every floor at every speed.
         speeds: speeds of the runs [m/s].
         turns: number of additional curved runs, on every floor at every speed.
         truth: true values of parameters, by path, that replace the usual ones [SI].
-        current, voltage: whether currents and voltages of the motors are logged.
+        current: True to simulate currents of the motors.
+        voltage: True to simulate voltages of the motors.
         seed: seed of the noise.
 
     Raises:

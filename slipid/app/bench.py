@@ -44,7 +44,7 @@ class BenchTask:
         choices: fixed, free and prior values of each motor's parameters, by the motor's label.
         skipped: one line about each log that is not used.
         columns_used: for a single file, one line about each channel and the columns assigned to it.
-        unit_is_known: whether the unit of the current was given or the config has a choice for the
+        unit_is_known: True if the unit of the current was given or the config has a choice for the
             resistance, so that an unlikely current is not refused.
     """
 
@@ -109,7 +109,7 @@ def read_motor_log(
         path: the log file.
         given: columns that the user named, by channel; other channels are found by column names.
         delimiter: text between cells, or None to guess it.
-        signed: whether currents have a sign.
+        signed: True if currents have a sign.
 
     Raises:
         DataError: the file cannot be read, or lacks a channel.

@@ -1,7 +1,8 @@
-"""The config of a robot and its logs: a TOML file checked once, every mistake with its key.
+"""The config of a robot and its logs: a TOML file, checked when it is read.
 
-Units are part of the key names, and every key with a default is optional. The docstring of a
-section explains its keys: `slipid reference` and `slipid new` print it.
+Every error message names the key that is wrong. Units are part of the names of keys, and every key
+with a default is optional. The docstring of a section explains its keys, and `slipid reference` and
+`slipid new` print these explanations.
 """
 
 import hashlib
@@ -22,19 +23,17 @@ Numbers = Number | list[Number]
 
 
 class WheeledDrive(Section):
-    """Keys of every robot.
+    """Keys that every robot on wheels has.
 
     Attributes:
         wheel_radius_m: rolling radius of the wheels under the robot's weight.
         gear_ratio: motor turns per wheel turn.
         mass_kg: mass of the robot as it drives; friction scales with it.
-        drives: wheels, counted from 1, that share a motor with its encoder and ammeter, in the
-            order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
-            Without
-                it
-            each wheel has its own.
-        motor: file that `slipid identify` or `slipid motor` wrote about its motor on a bench,
-            relative to the config.
+        drives: lists of wheels (counted from 1) that are driven by one motor with one encoder and
+            one ammeter, in the order of the columns of the logs. With [[1, 3], [2, 4]], one motor
+            drives both left wheels and one both right wheels. By default, each wheel has a motor.
+        motor: result of `slipid identify` or `slipid motor` for the robot's motor on a test bench;
+            its path is relative to the config.
     """
 
     wheel_radius_m: Positive
@@ -44,7 +43,7 @@ class WheeledDrive(Section):
     motor: str | None = None
 
     def drive_of(self, wheels: int) -> tuple[int, ...]:
-        """Return the number of each wheel's drive, from 0; empty where each has its own."""
+        """Return the index of each wheel's drive, or an empty tuple if no wheels share a drive."""
         if self.drives is None:
             return ()
         turned = [wheel for drive in self.drives for wheel in drive]
@@ -58,13 +57,15 @@ class WheeledDrive(Section):
 
 
 class OmniDrive(WheeledDrive):
-    """Wheels on a circle, each driving 90 deg ahead of its azimuth.
+    """Omnidirectional wheels on a circle around the middle, each driving along the circle.
 
     Attributes:
-        base_radius_m: distance from the middle to the wheel centres.
-        wheel_azimuths_deg: directions of the wheels from the middle, counter-clockwise from ahead,
-            in the order of the columns of the logs.
-        roller_angle_deg: angle from the rollers' free direction to the drive direction.
+        base_radius_m: distance from the middle of the robot to the wheel centres.
+        wheel_azimuths_deg: directions from the middle to the wheels, counter-clockwise from
+            straight ahead, in the order of the columns of the logs. A wheel drives 90 deg
+            counter-clockwise of this direction.
+        roller_angle_deg: angle from the direction in which the rollers roll freely to the drive
+            direction.
     """
 
     drive: Literal["omni"]
@@ -74,11 +75,14 @@ class OmniDrive(WheeledDrive):
 
 
 class FourWheelDrive(WheeledDrive):
-    """Four wheels, front left, front right, rear left, rear right: mecanum in X, or ordinary.
+    """Four wheels in the order front left, front right, rear left, rear right.
+
+    They are mecanum wheels, whose rollers form an X seen from above, or ordinary wheels (skid
+    steering).
 
     Attributes:
-        half_length_m: half the wheelbase, from the front axle to the rear one.
-        half_width_m: half the track, between the middles of left and right wheels.
+        half_length_m: half the distance between the front axle and the rear axle.
+        half_width_m: half the distance between the middles of the left and right wheels.
     """
 
     drive: Literal["mecanum", "skid"]
@@ -87,10 +91,10 @@ class FourWheelDrive(WheeledDrive):
 
 
 class DifferentialDrive(WheeledDrive):
-    """Two ordinary wheels on an axle, left and right, and casters.
+    """Two ordinary wheels on one axle, left and right; casters carry the rest of the weight.
 
     Attributes:
-        track_m: distance between the middles of the wheels.
+        track_m: distance between the middles of the two wheels.
     """
 
     drive: Literal["differential"]
@@ -98,14 +102,15 @@ class DifferentialDrive(WheeledDrive):
 
 
 class GeneralDrive(WheeledDrive):
-    """Any wheels: centres, drive directions, roller angles.
+    """Any arrangement of wheels, described by their centres, drive directions and roller angles.
 
     Attributes:
-        wheel_places_m: x (ahead) and y (left) of every wheel's centre, in the order of the columns.
+        wheel_places_m: x (ahead) and y (left) of every wheel's centre, in the order of the columns
+            of the logs.
         drive_directions_deg: direction in which each wheel rolls at a positive speed,
-            counter-clockwise from ahead.
-        roller_angles_deg: angle from each wheel's rollers to its drive direction; "none" is an
-            ordinary wheel.
+            counter-clockwise from straight ahead.
+        roller_angles_deg: angle from the direction in which each wheel's rollers roll freely to its
+            drive direction; "none" for an ordinary wheel.
     """
 
     drive: Literal["general"]
@@ -125,10 +130,10 @@ class GeneralDrive(WheeledDrive):
 
 
 class BenchMotors(Section):
-    """No wheels: motors on a bench, logged at their shafts.
+    """Motors on a test bench, without wheels, logged at their shafts.
 
     Attributes:
-        names: names of the motors in the order of the columns, where there are several.
+        names: names of the motors in the order of the columns of the logs, if there are several.
     """
 
     drive: Literal["motor"]
@@ -139,19 +144,21 @@ Wheels = OmniDrive | FourWheelDrive | DifferentialDrive | GeneralDrive
 
 
 class LogsSection(Section):
-    """Log files of one kind, found by a glob below the data folder.
+    """A set of log files that have the same layout.
 
     Attributes:
-        glob: selects the files, below the data folder.
-        format: one of the config's own layouts, or a preset.
-        surface: name of the floor; "folder" takes the name of the folder that each file lies in.
-        map: file of a floor map, relative to the config, instead of a surface: runs cross the
-            floors it shows, and their poses are in its frame.
-        load: name of the load set-up; each has its own wheel loads.
-        session: runs with this in common share a session, in which the marker stays in place.
-        session_name: instead of session: runs that belong together, of this section and of others
-            with the same name, such as those of a day, or between two set-ups of the robot.
-        min_rows: shorter runs are left out.
+        glob: pattern of the paths of the files, relative to the data folder, such as `runs/*.csv`.
+        format: name of the layout of the files: one defined in this config, or a preset.
+        surface: name of the floor; "folder" stands for the name of the folder that contains the
+            file.
+        map: file of a floor map, relative to the config; it replaces `surface` if runs drive over
+            several floors. The poses of the logs must be in the frame of the map.
+        load: name of the load set-up; the wheel loads are fitted separately for each set-up.
+        session: the property that runs of the same session have in common. Within a session the
+            marker or pose sensor stays in the same place on the robot.
+        session_name: name of the session of all runs of this section, instead of `session`;
+            sections with the same name share a session. Example: all runs of one day.
+        min_rows: runs with fewer rows are left out.
     """
 
     glob: str
@@ -166,29 +173,29 @@ class LogsSection(Section):
     @model_validator(mode="after")
     def _one_floor_or_many(self) -> "LogsSection":
         if self.map is not None and self.surface != "folder":
-            raise ValueError("surface and map at once; expected one of them")
+            raise ValueError("both surface and map are given; expected only one of them")
         if self.session_name is not None and "session" in self.model_fields_set:
-            raise ValueError("session and session_name at once; expected one of them")
+            raise ValueError("both session and session_name are given; expected only one of them")
         return self
 
 
 class CameraSection(Section):
-    """The camera that measured the pose.
+    """The camera, or another sensor, that measured the poses.
 
     Attributes:
-        image_centre_m: middle of the picture in the frame of the poses, where tilt and distortion
-            are zero.
+        image_centre_m: position of the middle of the picture in the frame of the poses; there the
+            errors due to tilt and distortion are zero.
     """
 
     image_centre_m: tuple[Number, Number] = (0.0, 0.0)
 
 
 class PriorSection(Section):
-    """Gaussian prior, in SI around its mean.
+    """Gaussian prior of a parameter, in SI units.
 
     Attributes:
-        mean: its centre, one number for all entries of a vector or one for each.
-        std: its standard deviation, likewise.
+        mean: mean of the prior: one number for all entries of a vector, or one number per entry.
+        std: standard deviation of the prior: one number, or one number per entry.
     """
 
     mean: Numbers
@@ -196,13 +203,13 @@ class PriorSection(Section):
 
 
 class ParameterSection(Section):
-    """Choice for the parameters that match a pattern.
+    """Settings for all parameters whose names match a pattern.
 
     Attributes:
-        start: start value [SI]; a number that is not fitted keeps it.
-        fixed: value that the number keeps [SI].
-        free: whether it is fitted.
-        prior: knowledge about it from elsewhere.
+        start: start value of the fit [SI]; a parameter that is not fitted keeps this value.
+        fixed: value at which the parameter is held during the fit [SI].
+        free: true to fit the parameter, false to keep it at its start value.
+        prior: prior from other measurements or from a data sheet; it makes the parameter free.
     """
 
     start: Numbers | None = None
@@ -213,22 +220,25 @@ class ParameterSection(Section):
     @model_validator(mode="after")
     def _not_both(self) -> "ParameterSection":
         if self.fixed is not None and (self.prior is not None or self.free):
-            raise ValueError("fixed and free or prior at once; expected one of them")
+            raise ValueError(
+                "fixed is given together with free or prior; expected only one of them"
+            )
         return self
 
 
 class WeightsSection(Section):
-    """Known weight on the wheels in a load set-up.
+    """Known weights on the wheels in a load set-up.
 
-    Either scales under each wheel give `kg`; or the set-up is `like` another one, with `mass_kg`
-    more (or less) at `place_m`.
+    Give either the readings of scales under each wheel (`kg`), or the difference from another
+    set-up: `like`, `mass_kg` and `place_m`.
 
     Attributes:
-        std_kg: standard deviation of each scale, or of the weight that the mass adds to each wheel.
-        kg: reading of the scales under each wheel, in the order of the wheels.
-        like: name of another load set-up.
-        mass_kg: mass added to that one; negative where it was taken away.
-        place_m: x (ahead) and y (left) of that mass, from the middle.
+        std_kg: standard deviation of each scale reading, or of the weight that the added mass puts
+            on each wheel.
+        kg: reading of the scale under each wheel, in the order of the wheels.
+        like: name of the load set-up from which this one differs.
+        mass_kg: mass that was added to the other set-up; negative if it was removed.
+        place_m: x (ahead) and y (left) of that mass, measured from the middle of the robot.
     """
 
     std_kg: Positive
@@ -243,25 +253,33 @@ class WeightsSection(Section):
         if self.kg is None and None in added:
             raise ValueError("expected kg, or like, mass_kg and place_m")
         if self.kg is not None and added != (None, None, None):
-            raise ValueError("kg and like, mass_kg or place_m at once; expected one of both ways")
+            raise ValueError(
+                "kg is given together with like, mass_kg or place_m; expected either kg or the "
+                "other three"
+            )
         return self
 
 
 class FitSection(Section):
-    """How finely runs are cut, how long to fit, and which lengths are trusted.
+    """Division of the runs into windows, end of the fit, and known lengths.
 
-    Motion determines the ratio of wheel radius to pose scale, and neither of them alone.
+    The motion of a robot determines only the ratio of wheel radius to pose scale, so one of the two
+    must be known.
 
     Attributes:
-        lengths_from: the known lengths: "poses" in true metres, as those of motion capture, lidar
-            and RTK are, make the wheel radius free; "wheels" that were measured make the scale of
-            the camera free. Without it both are as `[parameters]` says.
-        windows_per_piece: number of windows in a segment of a run.
-        longest_window_s: longer windows become more segments.
-        rounds: largest number of rounds.
-        tolerance: the fit ends when no number changes by more than this part of its standard
-            deviation.
-        seed: seed of the draws behind the bands of the curves.
+        lengths_from: the lengths that are known: "poses" if the poses are in true metres, as from
+            motion capture, lidar or RTK (the wheel radius is then fitted); "wheels" if the wheel
+            radius was measured (the scale of the camera is then fitted). By default `[parameters]`
+            decides which of the two is fitted.
+        windows_per_piece: number of neighbouring windows in a segment, which the fit treats as one
+            observation.
+        longest_window_s: longest duration of a window; if windows would be longer, a run gets more
+            segments.
+        rounds: largest number of rounds of the fit; each optimises the parameters and then the
+            noise variances.
+        tolerance: the fit ends when no parameter changes by more than this fraction of its standard
+            deviation in a round.
+        seed: seed of the random draws from which the uncertainty bands of curves are computed.
     """
 
     lengths_from: Literal["poses", "wheels"] | None = None
@@ -273,26 +291,27 @@ class FitSection(Section):
 
 
 class ValidateSection(Section):
-    """Runs to predict where they differ from those that were fitted.
+    """Runs that `slipid validate` predicts, if they are not the fitted ones.
 
     Attributes:
-        logs: sections as `[[logs]]`, for `slipid validate`.
+        logs: sections with the keys of `[[logs]]`.
     """
 
     logs: list[LogsSection] = Field(default_factory=list)
 
 
 class SelftestSection(Section):
-    """Plan and true values of a `selftest`, and the numbers that it must recover.
+    """Simulated runs of `slipid selftest`, and the parameters that it must recover.
 
     Attributes:
         surfaces: names of the simulated floors.
-        headings: number of directions in which runs are driven, evenly spread.
+        headings: number of evenly spread directions in which straight runs are driven.
         speeds_m_s: speeds of the runs.
-        turns: curved runs on each floor with each load set-up.
+        turns: number of curved runs on each floor with each load set-up.
         distance_m: length of a run.
-        truth: parameters by name, and their true value in the simulation.
-        wanted: patterns of the parameters that must be recovered; otherwise all free ones.
+        truth: true values of parameters in the simulation, by the name of the parameter.
+        wanted: patterns of the names of the parameters that must be recovered; by default all free
+            ones.
     """
 
     surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
@@ -305,18 +324,19 @@ class SelftestSection(Section):
 
 
 class ConfigContent(Section):
-    """The whole file.
+    """Tables of the config.
 
     Attributes:
-        robot: its wheels.
-        layouts: columns of your files and their channels, by names of your own.
-        logs: one section for each set of log files.
-        camera: the camera that measured the poses.
-        parameters: choices for parameters, by patterns of their names.
-        weights: known wheel loads, by load set-up.
-        fit: size of the windows and length of the fit.
-        selftest: plan that `slipid selftest` simulates where there are no logs.
-        validate: runs to predict instead of those that were fitted.
+        robot: wheels, gear and mass of the robot.
+        layouts: layouts of your log files, by names that you choose: the meaning and unit of each
+            column.
+        logs: one section for each set of log files with the same layout, floor and load.
+        camera: the camera, or another sensor, that measured the poses.
+        parameters: start values, fixed values and priors of parameters, by patterns of their names.
+        weights: known weights on the wheels, by the name of the load set-up.
+        fit: division of the runs into windows, end of the fit, and known lengths.
+        selftest: runs that `slipid selftest` simulates if it is given no logs.
+        validate: runs that `slipid validate` predicts instead of the fitted ones.
     """
 
     robot: Annotated[Wheels | BenchMotors, Field(discriminator="drive")]
@@ -331,13 +351,13 @@ class ConfigContent(Section):
 
     @property
     def wheels(self) -> Wheels:
-        """The robot's wheels.
+        """The robot section, if it describes wheels.
 
         Raises:
             ValueError: the config describes a motor on a bench.
         """
         if isinstance(self.robot, BenchMotors):
-            raise ValueError("drive = 'motor' has no wheels on a floor")
+            raise ValueError("drive = 'motor' describes motors on a bench, not wheels on a floor")
         return self.robot
 
     @model_validator(mode="after")
@@ -345,24 +365,25 @@ class ConfigContent(Section):
         for name, sections in (("logs", self.logs), ("validate.logs", self.validate_.logs)):
             if sections and not single_floor_sections(sections):
                 raise ValueError(
-                    f"{name}: every section has a map; expected one without, of runs on one floor"
+                    f"{name}: every section has a map; expected at least one section without a "
+                    "map, whose runs stay on one floor"
                 )
         return self
 
 
 def single_floor_sections(sections: Sequence[LogsSection]) -> list[LogsSection]:
-    """Return the sections whose runs stay on one floor each."""
+    """Return the sections in which every run stays on a single floor."""
     return [section for section in sections if section.map is None]
 
 
 @dataclass(frozen=True)
 class Config:
-    """A checked config file; its text is kept beside the results.
+    """Checked content of a config file, with its text, which is copied into result folders.
 
     Attributes:
-        path: where it was read.
-        text: its text.
-        content: its checked content.
+        path: path of the file.
+        text: text of the file.
+        content: checked content of the file.
     """
 
     path: Path
@@ -371,22 +392,22 @@ class Config:
 
     @property
     def hash(self) -> str:
-        """Hash of the text."""
+        """SHA-256 hash of the text."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
 
 def read_config(path: Path) -> Config:
-    """Return the config in a TOML file; errors as in `parsed`, also where it is unreadable."""
+    """Return the config in a TOML file; raise `DataError` if it is unreadable or wrong."""
     return parsed(path, text_of(path))
 
 
 def parsed(path: Path, text: str) -> Config:
-    """Return the config in TOML text; raise `DataError` with every mistake on a line of its own."""
+    """Return the config in TOML text; raise `DataError` that lists all mistakes, one per line."""
     return Config(path, text, checked(path, mapping_of(path, text), ConfigContent))
 
 
 def geometry(robot: Wheels) -> Geometry:
-    """Return the geometry of a `[robot]` section; raise `ValueError` where it cannot drive."""
+    """Return the geometry of a `[robot]` section; raise `ValueError` if it is impossible."""
     radius, gear = robot.wheel_radius_m, robot.gear_ratio
     if isinstance(robot, OmniDrive):
         azimuths, base = robot.wheel_azimuths_deg, robot.base_radius_m

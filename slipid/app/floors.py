@@ -33,7 +33,7 @@ class RunFloors:
         pose: pose of the body in the frame of the map: x, y [m], heading [rad].
         surface: number of the surface under each wheel.
         border: distance of each wheel from the nearest place with another surface [m].
-        inside: whether each wheel is on the map; if not, its floor is unknown.
+        inside: True if each wheel is on the map; if not, its floor is unknown.
     """
 
     name: str

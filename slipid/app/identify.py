@@ -77,7 +77,7 @@ def identify(
         out: folder to write to.
         report: reporter of the progress.
         profiles: paths of parameters whose profile likelihood is computed.
-        anyway: whether to fit even if logs and config contradict each other, which is reported.
+        anyway: True to fit even if logs and config contradict each other, which is reported.
 
     Raises:
         DataError: config or logs are wrong; in this case nothing was written.

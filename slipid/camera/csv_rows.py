@@ -23,7 +23,7 @@ def csv_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; expected {expected}") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: no CSV text in UTF-8; expected {expected}") from error
+        raise DataError(f"{path}: not CSV text in UTF-8; expected {expected}") from error
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
     first = next((line for _, line in lines if line.strip()), "")
     delimiter = max(",;\t", key=first.count)

@@ -47,7 +47,7 @@ class FrameSource(ABC):
         name: name of the source in messages.
         image_px: width and height of every frame [pixel].
         count: expected number of frames; None if it is not known.
-        exact: whether `count` is exact, as it is if a time is given for each frame.
+        exact: True if `count` is exact, as it is if a time is given for each frame.
         identity: text that differs if the content differs, such as name, size and date of a file.
     """
 
@@ -77,7 +77,7 @@ def cut_off(source: FrameSource, count: int) -> str | None:
 
 
 def stamp(path: Path) -> tuple[str, int, int]:
-    """Return name, size and date of a file, by which a change of its content is recognised."""
+    """Return name, size and date of a file, which show whether its content has changed."""
     status = path.stat()
     return path.name, status.st_size, status.st_mtime_ns
 

@@ -97,7 +97,7 @@ class Video(FrameSource):
         return cls(str(path), size_of(first), count, times is not None, identity, times, fps)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the frames from number `first` on; earlier ones are skipped without decoding.
+        """Yield the frames, beginning with number `first`; earlier ones are not decoded.
 
         Raises:
             DataError: the file has no times, times do not increase, or too few were given.
@@ -210,7 +210,7 @@ class PictureFolder(FrameSource):
         return cls(str(place), size, len(paths), True, identity, tuple(paths), times)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the pictures from number `first` on; raise `DataError` if one has another size."""
+        """Yield the pictures from number `first`; raise `DataError` if one has another size."""
         for k in range(first, len(self.paths)):
             picture = read_picture(self.paths[k])
             if size_of(picture) != self.image_px:

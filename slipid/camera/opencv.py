@@ -108,7 +108,7 @@ def is_picture(path: Path) -> bool:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """Return the pictures in a folder by name; raise `DataError` if there is none."""
+    """Return the pictures in a folder, sorted by name; raise `DataError` if there is none."""
     if paths := sorted(filter(is_picture, folder.iterdir())):
         return paths
     raise DataError(f"{folder}: no picture; expected {', '.join(SUFFIXES)}")
@@ -131,7 +131,7 @@ def read_picture(path: Path) -> np.ndarray:
     except cv2.error:  # OpenCV raises this for too large pictures
         picture = None
     if picture is None:
-        raise DataError(f"{path}: no picture that OpenCV reads; expected PNG, JPEG or the like")
+        raise DataError(f"{path}: not a picture that OpenCV reads; expected PNG, JPEG or the like")
     return np.asarray(picture)
 
 

@@ -221,7 +221,7 @@ class CameraFile(Section):
         """Return the camera; raise `DataError` if the file `path` contains the lens alone."""
         if self.rotation_from_world is None or self.place_m is None:
             raise DataError(
-                f"{path}: a lens without a floor; expected one with rotation_from_world and "
+                f"{path}: a lens without a place above the floor; expected rotation_from_world and "
                 "place_m: `slipid calibrate --camera FILE --floor PICTURE` adds them"
             )
         rotation, place = np.array(self.rotation_from_world), np.array(self.place_m)

@@ -11,22 +11,22 @@ from slipid.support.progress import Reporter
 def benchmark(
     data: Annotated[Path, option("DIR", "Folder of the public data sets.")],
     out: Out = Path("out/benchmark"),
-    quick: Annotated[
-        bool, flag("--quick", "Some of the runs, one fold of headings, given floors.")
-    ] = False,
-    rows: Annotated[str | None, option("NAMES", "Rows, by commas; all by default.")] = None,
+    quick: Annotated[bool, flag("--quick", "Use some of the runs and a single fold only.")] = False,
+    rows: Annotated[
+        str | None, option("NAMES", "Methods to run, separated by commas; all by default.")
+    ] = None,
     jobs: Jobs = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Run every published slip system on the same logs beside slipid: one table, with intervals.
+    """Run slipid and published slip estimators on the same logs, and compare their errors.
 
-    The folder of --data has the folders of the public data sets: robotino2022, robotino2021,
-    drive_skid, borealtc; absent ones are skipped. Recorded runs of the virtual test site are always
-    included. It takes about 17 minutes on two cores, --quick about two, and three the first time.
-    Rows are published systems by name, such as ojeda_gyro or quann_slip; a wrong name lists all of
-    them. Writes benchmark.json and benchmark.html. An interrupted benchmark is continued from what
-    is done. The exit code is 1 where anything failed.
+    The folder given by --data contains the folders of the public data sets: robotino2022,
+    robotino2021, drive_skid, borealtc; missing ones are skipped. Simulated runs of the virtual test
+    site, which ship with slipid, are always included. The benchmark takes about 17 minutes on two
+    cores; with --quick about two, and three the first time. Examples of methods are ojeda_gyro and
+    quann_slip; a wrong name prints the list of all. Writes benchmark.json and benchmark.html. After
+    an interrupt, finished parts are not computed again. The exit code is 1 if anything failed.
     """
     from slipid.lab.benchmark.benchmark import benchmark as run
     from slipid.lab.benchmark.plots import benchmark_pictures
@@ -38,7 +38,7 @@ def benchmark(
         found = run(BenchmarkOptions(data, out, only, quick), executor, report)
         report.stage("drawing")
         written = write_page(found, benchmark_pictures(found), out)
-        report.line(f"in {out}: benchmark.json, {written.name}")
+        report.line(f"written to {out}: benchmark.json, {written.name}")
     emit(json, found, lambda page: show_benchmark(page, found))
     every = [
         row

@@ -25,57 +25,73 @@ SIZE_STD = 0.001
 def calibrate(
     pictures: Annotated[
         list[str] | None,
-        typer.Argument(metavar="PICTURE...", help="Pictures of a board: files, folders or globs."),
+        typer.Argument(
+            metavar="PICTURE...", help="Pictures of a ChArUco board: files, folders or globs."
+        ),
     ] = None,
     out: Annotated[Path, option("FILE", "Camera file to write.")] = Path("camera.json"),
     board: Annotated[
-        str | None, option("7x5", "Squares of the ChArUco board along x and y.")
+        str | None, option("7x5", "Number of squares of the ChArUco board along x and y.")
     ] = None,
-    square: Annotated[float | None, option("M", "Edge of a square, in m.")] = None,
-    marker: Annotated[float | None, option("M", "Edge of a marker, in m.")] = None,
-    dictionary: Annotated[str, option("NAME", "Dictionary of the board's markers.")] = "4X4_50",
-    legacy: Annotated[bool, flag("--legacy", "The board was drawn by OpenCV before 4.6.")] = False,
-    k3: Annotated[
-        bool, flag("--k3", "Also fit k3, for wide lenses whose error stays large.")
+    square: Annotated[float | None, option("M", "Edge length of a square, in m.")] = None,
+    marker: Annotated[float | None, option("M", "Edge length of a marker, in m.")] = None,
+    dictionary: Annotated[
+        str, option("NAME", "Name of the dictionary of the board's markers.")
+    ] = "4X4_50",
+    legacy: Annotated[
+        bool, flag("--legacy", "The board was drawn by a version of OpenCV before 4.6.")
     ] = False,
-    camera: Annotated[Path | None, option("FILE", "Camera file with a known lens.")] = None,
+    k3: Annotated[
+        bool,
+        flag("--k3", "Also fit the distortion term k3, for wide-angle lenses with a large error."),
+    ] = False,
+    camera: Annotated[
+        Path | None, option("FILE", "Camera file with a calibrated lens, instead of pictures.")
+    ] = None,
     floor: Annotated[
-        Path | None, option("PICTURE", "Picture of the board lying on the floor.")
+        Path | None, option("PICTURE", "Picture in which the board lies on the floor.")
     ] = None,
     board_height: Annotated[
-        float, option("M", "Height of the lying board's face above the floor, in m.")
+        float, option("M", "Height of the board's printed face above the floor, in m.")
     ] = 0.0,
     points: Annotated[
-        Path | None, option("CSV", "Measured points: u, v, x, y and maybe z.")
+        Path | None,
+        option("CSV", "CSV of measured points: u, v [pixel], x, y and optionally z [m]."),
     ] = None,
     size_std: Annotated[
         float | None,
-        option("PART", "Relative std of the board's or tape's size; 0.001 by default."),
+        option("PART", "Relative standard deviation of the measured lengths; 0.001 by default."),
     ] = None,
     metres_per_pixel: Annotated[
-        float | None, option("M", "Size of a pixel on the floor, without any calibration.")
+        float | None,
+        option("M", "Length of a pixel on the floor, in m, if nothing was calibrated."),
     ] = None,
     lens_height: Annotated[
-        float | None, option("M", "Height of the lens, with --metres-per-pixel.")
+        float | None,
+        option("M", "Height of the lens above the floor, in m; with --metres-per-pixel."),
     ] = None,
     turn: Annotated[
-        float | None, option("DEG", "Turn of the world's x and y, with --metres-per-pixel.")
+        float | None,
+        option("DEG", "Rotation of the world's axes, in deg; with --metres-per-pixel."),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Calibrate an overhead camera from ChArUco pictures: its lens and its place above the floor.
+    """Calibrate an overhead camera from pictures of a ChArUco board: its lens, and its pose.
 
-    The lens comes from PICTURE... or --camera, the floor from --floor or --points. The world's
-    origin is on the floor below the middle of the lying board, x along its columns, y up its rows,
-    z up; or as the points say. Without any calibration, --metres-per-pixel and --lens-height make a
-    camera that looks straight down: origin in the middle of the picture, x right, y up.
+    The lens is calibrated from PICTURE... or read from --camera; the pose above the floor follows
+    from --floor or --points. With --floor, the origin of the world is on the floor below the middle
+    of the board, with x along the columns of the board, y along its rows, and z up. With --points,
+    the measured points define the axes. Without any calibration, --metres-per-pixel and
+    --lens-height describe a camera that looks straight down; the origin is then in the middle of
+    the picture, with x to the right and y up.
 
-    A point h above the floor, seen from a height H, appears H / (H - h) times as far from the point
-    below the lens as it is: with H = 2.4 m and h = 0.25 m lengths read on the floor would be 11.6 %
-    too long. Calibrate on the floor, and give a marker's height where it is read.
+    For a lens at height H, a point at height h above the floor appears too far from the point below
+    the lens, by the factor H / (H - h). With H = 2.4 m and h = 0.25 m, lengths would be 11.6 % too
+    long. Therefore calibrate on the floor, and give the height of the robot's marker to `slipid
+    track`.
 
-    The exit code is 1 where the camera is poor but usable: the file is written, and says why.
+    The exit code is 1 if the calibration is poor but usable: the file is written, with the reasons.
     """
     from slipid.camera.calibration.calibrate import (
         floor_from_board,
@@ -89,8 +105,9 @@ def calibrate(
     if any(value is not None for value in described):
         if any((board, camera, floor, points)) or len(words) != 1:
             raise DataError(
-                "--metres-per-pixel, --lens-height and --turn are without any calibration; "
-                "expected a single picture beside them, and no board, camera, floor or points"
+                "--metres-per-pixel, --lens-height and --turn describe a camera without "
+                "calibration; expected a single picture with them, and no --board, --camera, "
+                "--floor or --points"
             )
         return _uncalibrated(Path(words[0]), described, size_std, out, json)
     _refuse_combinations(words, camera, floor, points)
@@ -101,7 +118,7 @@ def calibrate(
         if camera is not None:
             lens = lens_from_file(camera)
         else:
-            assert seen is not None  # since there are pictures
+            assert seen is not None  # a board is required if there are pictures
             lens = lens_from_pictures(words, seen, k3)
         fit = None
         if points is not None:
@@ -123,9 +140,14 @@ def _refuse_combinations(
     if bool(words) == (camera is not None):
         raise DataError("expected either pictures of a board, or --camera FILE with a known lens")
     if floor is not None and points is not None:
-        raise DataError("--floor and --points; expected one of them: each gives the whole place")
+        raise DataError(
+            "both --floor and --points are given; expected only one of them, since each "
+            "determines the pose"
+        )
     if camera is not None and floor is None and points is None:
-        raise DataError(f"--camera {camera} alone; expected --floor PICTURE or --points CSV too")
+        raise DataError(
+            f"--camera {camera} alone; expected --floor PICTURE or --points CSV with it"
+        )
 
 
 def _positive(option: str, value: float | None) -> float:
@@ -146,7 +168,9 @@ def _board(
     from slipid.camera.calibration.board import board_of
 
     if size is None:
-        raise DataError("--board is missing; expected squares along x and y, such as 7x5")
+        raise DataError(
+            "--board is missing; expected the numbers of squares along x and y, such as 7x5"
+        )
     square, marker = map(_positive, ("--square", "--marker"), edges)
     return board_of(size, square, marker, dictionary, legacy)
 

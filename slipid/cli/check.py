@@ -18,9 +18,9 @@ def check(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Read and validate logs; report errors, and what a fit can be expected to identify.
+    """Check logs against the config, and predict which parameters a fit will identify.
 
-    Exit code 1 where logs and config contradict each other.
+    The exit code is 1 if logs and config contradict each other.
     """
     from slipid.app import check as checks
     from slipid.app.config import BenchMotors, read_config

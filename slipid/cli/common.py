@@ -1,4 +1,4 @@
-"""Code that commands share: types of options, exit codes, and output for people and programs."""
+"""Code shared by commands: types of options, exit codes, and output as text and JSON."""
 
 import functools
 import os
@@ -43,14 +43,24 @@ def flag(name: str, words: str) -> OptionInfo:
     return made
 
 
-ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config, a TOML file.")]
-OutFolder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder identify wrote.")]
-DataFolder = Annotated[Path, option("DIR", "Folder the globs of the config start from.")]
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config file (TOML).")]
+OutFolder = Annotated[
+    Path, typer.Argument(metavar="OUT", help="Result folder of `slipid identify`.")
+]
+DataFolder = Annotated[
+    Path, option("DIR", "Folder of the logs, to which globs in the config refer.")
+]
 Out = Annotated[Path, option("DIR", "Folder to write to.")]
-MaybeOut = Annotated[Path | None, option("DIR", "Folder to write to, if wanted.")]
-Load = Annotated[str | None, option("NAME", "Load set-up; the first by default.")]
-Jobs = Annotated[int | None, typer.Option(min=1, help="Processes at once; by default all cores.")]
-Json = Annotated[str | None, option("FILE", "Also write JSON there; - is stdout.")]
+MaybeOut = Annotated[
+    Path | None, option("DIR", "Folder to write to; by default nothing is written.")
+]
+Load = Annotated[str | None, option("NAME", "Name of the load set-up; the first by default.")]
+Jobs = Annotated[
+    int | None, typer.Option(min=1, help="Number of parallel processes; by default one per core.")
+]
+Json = Annotated[
+    str | None, option("FILE", "Also write the result as JSON to this file; - for stdout.")
+]
 Quiet = Annotated[bool, flag("--quiet", "No progress.")]
 Words = ParamSpec("Words")
 
@@ -58,7 +68,7 @@ Words = ParamSpec("Words")
 def executor_of(jobs: int | None) -> "Executor":
     """Return an executor with `jobs` processes, by default one per core.
 
-    If the number is 1, jobs run in this process.
+    With one job, the work runs in this process.
     """
     from slipid.support.executor import InProcess, Processes
 
@@ -67,9 +77,10 @@ def executor_of(jobs: int | None) -> "Executor":
 
 
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
-    """Return a command whose errors become exit codes.
+    """Return a command that turns exceptions into exit codes.
 
-    Bad input (`DataError`) becomes a message and exit code 2, an interrupt exit code 130.
+    For bad input (`DataError`) it prints the message and exits with code 2, after an interrupt with
+    code 130.
     """
 
     @functools.wraps(command)
@@ -77,7 +88,10 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
         try:
             code = command(*args, **options)
         except KeyboardInterrupt:
-            typer.echo("interrupted; the next call goes on from what was kept, if any", err=True)
+            typer.echo(
+                "interrupted; the same command continues from the last checkpoint, if there is one",
+                err=True,
+            )
             raise typer.Exit(130) from None
         except DataError as error:
             typer.echo(str(error), err=True)
@@ -88,10 +102,10 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
 
 
 def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
-    """Return a command as `guarded` does, which first refuses the config or result of a bench.
+    """Return a guarded command that refuses the config or result of motors on a bench.
 
-    It is for commands that do not apply to motors on a bench. The config, or the folder of a
-    result, is the first path among the arguments of a command.
+    The config or result folder is taken to be the first path among the arguments of the command.
+    See `guarded` for the exit codes.
     """
 
     @functools.wraps(command)
@@ -99,9 +113,9 @@ def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
         paths = (value for value in (*args, *options.values()) if isinstance(value, Path))
         if (first := next(paths, None)) is not None and is_bench(first):
             raise DataError(
-                f"{first}: drive = 'motor' has no wheels on a floor: `slipid {command.__name__}` "
-                "does not apply; `slipid check`, `identify` and `motor` do, and a robot's config "
-                "takes the numbers by [robot] motor = 'FILE'"
+                f"{first}: drive = 'motor' describes motors on a bench, for which `slipid "
+                f"{command.__name__}` is not made; expected `slipid check`, `identify` or "
+                "`motor`. The config of a robot can use the result by [robot] motor = 'FILE'"
             )
         return command(*args, **options)
 
@@ -109,7 +123,7 @@ def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
 
 
 def is_bench(path: Path) -> bool:
-    """Return whether a config, or the result in a folder, is of motors on a bench."""
+    """Return True if a config, or the config in a result folder, describes motors on a bench."""
     import tomllib
 
     if path.is_dir():
@@ -136,9 +150,9 @@ def emit(
         json: file for the JSON; `-` writes it to stdout, and then nothing else is printed; None for
             no JSON.
         content: content of the JSON.
-        show: function that prints the result on a page.
+        show: function that prints the result as text.
         out: folder to which the command wrote files, or None.
-        written: names of these files, which are printed.
+        written: names of these files, to be printed.
     """
     from slipid.report.page import Page
     from slipid.support.files import json_text, write_json

@@ -12,15 +12,15 @@ def compare(
     data: DataFolder,
     out: Out,
     folds: Annotated[
-        str, option("NAMES", "Kinds of held-out runs, by commas.")
+        str, option("NAMES", "Kinds of held-out runs, separated by commas.")
     ] = "sectors,speeds,random",
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Say which slip model is right for each floor, or that the data cannot decide it.
+    """Find the best slip model for each floor by cross-validation, if the data can decide it.
 
-    Every model is fitted without some runs and judged on them. Writes comparison.json and a
-    picture; finished folds are kept and not fitted again.
+    Every model is fitted without the held-out runs and then judged by its predictions of them.
+    Writes comparison.json and a picture. Finished folds are kept in OUT and are not fitted again.
     """
     from slipid.app.compare import compare as run
     from slipid.plots.compare import compare_plot
@@ -28,6 +28,6 @@ def compare(
 
     with Reporter(quiet=quiet) as report:
         found = run(config, data, out, folds.replace(" ", "").split(","), report)
-        report.line(f"in {out}: comparison.json, {compare_plot(found, out).name}")
+        report.line(f"written to {out}: comparison.json, {compare_plot(found, out).name}")
     emit(json, found, lambda page: show_comparison(page, found))
     return 0 if all(q["converged"] for q in found["questions"].values()) else 1

@@ -16,22 +16,24 @@ if TYPE_CHECKING:
     from slipid.app.identify import IdentifyResult
 
 PARTS = ("fit", "unseen")
-"""Folders of the runs to fit and of those to predict; the config of each is
-`testsite_<part>.toml`."""
+"""Folders of the runs that are fitted and of those that are predicted.
+
+The config of each is `testsite_<part>.toml`."""
 
 
 @guarded
 def demo(
     out: Out = Path("demo_out"),
     plant: Annotated[
-        str, option("NAME", "recorded, or mujoco to drive the logs anew.")
+        str,
+        option("NAME", "`recorded` for logs that ship with slipid, `mujoco` to simulate new ones."),
     ] = "recorded",
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of runs that are driven anew.")
+        int | None, typer.Option(min=0, help="Seed of the simulation, with --plant mujoco.")
     ] = None,
     quiet: Quiet = False,
 ) -> int:
-    """Run the whole chain on small logs of the virtual test site: a folder to look at."""
+    """Identify a robot from small logs of the virtual test site; write all results to a folder."""
     with Reporter(quiet=quiet) as report, executor_of(None) as executor:
         done, found, truth = run(out, plant, seed, executor, report)
     from slipid.report.estimates import show_truth, show_validation
@@ -39,7 +41,7 @@ def demo(
 
     page, result = Page(), out / "result"
     show_truth(page, done.fit, truth)
-    page.line("runs it has not seen, predicted open loop:")
+    page.line("open-loop predictions of runs that were not fitted:")
     show_validation(page, found)
     pictures = [result / name for name in done.written if name.endswith(".png")]
     pictures += sorted(result.glob("validation_*.png"))
@@ -69,9 +71,9 @@ def run(
     from slipid.support.files import read_json, write_bytes, write_json
 
     if plant not in ("recorded", "mujoco"):
-        raise DataError(f"no plant '{plant}'; expected recorded or mujoco")
+        raise DataError(f"--plant {plant}: unknown; expected recorded or mujoco")
     if plant == "recorded" and seed is not None:
-        raise DataError("--seed is for runs that are driven anew; expected --plant mujoco with it")
+        raise DataError("--seed without a simulation; expected --plant mujoco with it")
     source = out / plant
     if plant == "recorded":
         report.stage("unpacking recorded logs")
@@ -83,12 +85,14 @@ def run(
     done = identify(out / "robotino.toml", source / "fit" / "logs", result, report)
     found = validate(result, source / "unseen" / "logs", report)
     write_json(result / "validation.json", found)
-    truth = read_json(source / "fit/truth/truth.json", "the truth that slipid simulate wrote")
+    truth = read_json(
+        source / "fit/truth/truth.json", "the true values that `slipid simulate` wrote"
+    )
     return done, found, truth["parameters"]
 
 
 def drive_anew(out: Path, seed: int, executor: "Executor", report: Reporter) -> None:
-    """Simulate anew, on the test site, all runs whose recorded logs ship with slipid."""
+    """Simulate on the test site all runs whose logs also ship with slipid."""
     from slipid.app.logs import packaged_config
     from slipid.lab.testsite.config import plan
     from slipid.lab.testsite.simulate import simulate

@@ -16,32 +16,48 @@ if TYPE_CHECKING:
 def design(
     out: OutFolder,
     parameter: Annotated[
-        list[str] | None, option("NAME", "Parameter to sharpen; * and ? allowed; may be repeated.")
+        list[str] | None,
+        option(
+            "NAME",
+            "Parameter whose uncertainty is to be reduced, with * and ? as wildcards; may be "
+            "repeated.",
+        ),
     ] = None,
     predict: Annotated[
         list[str] | None,
         option(
             "FLOOR[@LOAD][:SPEED[:HEADING]]",
-            "Prediction to sharpen, as gray:0.3:45 (m/s, deg); may be repeated.",
+            "Prediction whose uncertainty is to be reduced, such as gray:0.3:45 (m/s, deg); may "
+            "be repeated.",
         ),
     ] = None,
-    runs: Annotated[int, typer.Option(min=1, max=1000, help="How many to propose.")] = 12,
+    runs: Annotated[int, typer.Option(min=1, max=1000, help="Number of runs to propose.")] = 12,
     headings: Annotated[
-        str | None, option("LIST", "Headings of candidates, as 0,45,90, in deg.")
+        str | None, option("LIST", "Headings of candidate runs in deg, such as 0,45,90.")
     ] = None,
     speeds: Annotated[
-        str | None, option("LIST", "Speeds of candidates, as 0.1,0.2, in m/s.")
+        str | None, option("LIST", "Speeds of candidate runs in m/s, such as 0.1,0.2.")
     ] = None,
-    turns: Annotated[str | None, option("LIST", "Turning rates, as -40,0,40, in deg/s.")] = None,
+    turns: Annotated[
+        str | None, option("LIST", "Turning rates of candidate runs in deg/s, such as -40,0,40.")
+    ] = None,
     distance: Annotated[
-        float | None, option("M", "Length of a run, in m; as driven by default.")
+        float | None, option("M", "Length of a run in m; by default that of the logged runs.")
     ] = None,
-    floor: Annotated[list[str] | None, option("NAME", "Floor that can be driven on.")] = None,
-    load: Annotated[list[str] | None, option("NAME", "Load set-up that can be driven.")] = None,
+    floor: Annotated[
+        list[str] | None,
+        option("NAME", "Floor on which runs are possible; may be repeated; all by default."),
+    ] = None,
+    load: Annotated[
+        list[str] | None,
+        option(
+            "NAME", "Load set-up with which runs are possible; may be repeated; all by default."
+        ),
+    ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Propose the next runs: those that most reduce the uncertainty of a parameter or a prediction.
+    """Propose the runs that would most reduce the uncertainty of a parameter or a prediction.
 
     Writes design.json, design.png and design_commands.csv to OUT.
     """

@@ -16,31 +16,38 @@ def export(
         Path,
         typer.Argument(
             metavar="OUT|ROBOT.json|DIR",
-            help="Folder identify wrote, or its robot; with --check the exported folder.",
+            help="Result folder of `slipid identify`, or a robot.json; with --check an exported "
+            "folder.",
         ),
     ],
     to: Annotated[
-        str, option("FORMS", "By commas: c, ros2, stablehlo, table.")
+        str, option("FORMS", "Forms separated by commas: c, ros2, stablehlo, table.")
     ] = "c,ros2,stablehlo,table",
     out: Annotated[Path | None, option("DIR", "Folder to write to.")] = None,
     controller: Annotated[
-        str, option("NAME", "Row of the trial: contact, slip_odometry, ...")
+        str, option("NAME", "Controller: contact, slip_odometry, ... (as in `slipid trial`).")
     ] = "contact",
-    path: Annotated[str, option("NAME", "Path that the example in C follows.")] = "rectangle",
-    speed: Annotated[float, option("M_S", "Along the path, in m/s.")] = 0.2,
+    path: Annotated[
+        str, option("NAME", "Path that the example program in C follows.")
+    ] = "rectangle",
+    speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
     load: Load = None,
-    floors: Annotated[str, option("NAMES", "Floors there are, by commas; all by default.")] = "",
-    map: Annotated[Path | None, option("FILE", "Floor map, for contact_map.")] = None,
+    floors: Annotated[
+        str, option("NAMES", "Floors that can occur, separated by commas; all by default.")
+    ] = "",
+    map: Annotated[
+        Path | None, option("FILE", "Floor map, for the controller contact_map.")
+    ] = None,
     check: Annotated[
-        bool, flag("--check", "Only check a folder that was exported before.")
+        bool, flag("--check", "Only check that the files of an exported folder are unchanged.")
     ] = False,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Write robot.json and its exported forms to a folder: C99, ROS 2, StableHLO, tables of gains.
+    """Export an identified robot to a folder: robot.json, C99, ROS 2, StableHLO, tables of gains.
 
-    The folder has a README, and the checksum of every file. With --check nothing is written, and
-    exit code 2 says that a byte was changed.
+    The folder also gets a README and a checksum of every file. With --check nothing is written; the
+    exit code is 2 if a file was changed.
     """
     from slipid.deploy.deploy import read_robot
     from slipid.deploy.export import ExportOptions
@@ -59,10 +66,10 @@ def export(
 
             load_program(source / "stablehlo")
         found = {"folder": str(source), "files": list(names), "intact": True}
-        emit(json, found, lambda page: page.line(f"{source}: all {len(names)} files as written"))
+        emit(json, found, lambda page: page.line(f"{source}: all {len(names)} files are unchanged"))
         return 0
     if out is None:
-        raise DataError("no folder to write to; name one with --out DIR")
+        raise DataError("--out is missing; expected a folder to write to")
     with Reporter(quiet=quiet) as report:
         report.stage("reading the robot")
         robot = read_robot(source, load, _names(floors))

@@ -12,25 +12,26 @@ if TYPE_CHECKING:
 
 
 MOST_BEYOND = 0.05
-"""Largest share of wheel positions beyond the map with which the exit code is 0 [1]."""
+"""The exit code is 1 if more than this share of the wheel positions is outside the map [1]."""
 
 
 @for_robots
 def floors(
     fitted: OutFolder,
-    map: Annotated[Path, option("FILE", "Floor map, as slipid map writes.")],
+    map: Annotated[Path, option("FILE", "Floor map, as written by `slipid map`.")],
     data: DataFolder,
     out: Out,
     logs: Annotated[
-        str | None, option("GLOB", "Which logs; those with a map in the config by default.")
+        str | None,
+        option("GLOB", "Glob of the logs; by default the logs with a map in the config."),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Find the floor under each wheel in logged runs, and the distance to its border.
+    """Find the floor under each wheel in logged runs, and the distance to the next floor.
 
-    Poses are corrected by the camera of the fit. A CSV file is written for each run. The exit code
-    is 1 where wheels are often beyond the map.
+    The poses are corrected with the camera parameters of the fit. A CSV file is written for each
+    run. The exit code is 1 if wheels are often outside the map.
     """
     from slipid.app.floors import floors_under, summary, write_floors
     from slipid.support.jax_setup import setup_jax
@@ -48,9 +49,9 @@ def show(page: "Page", content: Content) -> None:
     """Print, for each run, the share of time in which each floor was under each wheel."""
     from slipid.report.page import table
 
-    shares = table(("run", *content["surfaces"]), "percent of the time under wheel 1, 2, ...")
+    shares = table(("run", *content["surfaces"]), "percentage of the time, for wheel 1, 2, ...")
     for name, run in content["runs"].items():
         shares.add_row(name, *(" ".join(f"{100 * v:3.0f}" for v in row) for row in run.values()))
     page.table(shares)
     if beyond := content["beyond_the_map"]:
-        page.line(f"note: {100 * beyond:.1f} % of the wheels' places are beyond the map")
+        page.line(f"note: {100 * beyond:.1f} % of the wheel positions are outside the map")

@@ -21,18 +21,19 @@ def identify(
     data: DataFolder,
     out: Out,
     profile: Annotated[
-        list[str] | None, option("PATH", "Also profile a number's likelihood; may be repeated.")
+        list[str] | None,
+        option("PATH", "Also compute the profile likelihood of a parameter; may be repeated."),
     ] = None,
     anyway: Annotated[
-        bool, flag("--anyway", "Fit logs and config that do not go together.")
+        bool, flag("--anyway", "Fit even if logs and config contradict each other.")
     ] = False,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Fit motors, floors, loads and camera to the logs, end to end.
+    """Fit the parameters of motors, floors, loads and camera to logs.
 
-    Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt. Exit code
-    1 where it did not converge, or predicts worse than the encoders.
+    Writes identified.json, fit.json, robot.json and pictures. An interrupted fit is continued. The
+    exit code is 1 if the fit did not converge, or predicts runs worse than the encoders alone.
     """
     from slipid.app.config import BenchMotors, read_config
     from slipid.report.estimates import show_fit, show_trust
@@ -43,7 +44,7 @@ def identify(
         return bench(wanted, data, out, profile or (), json, quiet)
     with Reporter(quiet=quiet) as report:
         done = run(config, data, out, report, profile or (), anyway)
-    content = read_json(out / "identified.json", "what identify wrote")
+    content = read_json(out / "identified.json", "a result of `slipid identify`")
 
     def show(page: "Page") -> None:
         show_fit(page, done.fit, done.profiles)
@@ -80,8 +81,8 @@ def run(
     try:
         warning = done.trust.warning
         drawn += identify_plots(done.fit, done.task.dataset, out, warning)
-    except DataError as error:  # a run is too short to draw; the numbers are written already
-        report.line(f"no more pictures: {error}")
+    except DataError as error:  # a run is too short to be drawn; the results are already written
+        report.line(f"no further pictures: {error}")
     if done.profiles:
         drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
     return replace(done, written=(*done.written, *(path.name for path in drawn)))
@@ -96,9 +97,7 @@ def bench(
     from slipid.report.estimates import show_bench
 
     if profile:
-        raise DataError(
-            "--profile: not of drive = 'motor', whose intervals need none; leave it out"
-        )
+        raise DataError("--profile is not available for drive = 'motor'; leave it out")
     with Reporter(quiet=quiet) as report:
         fit, written = identify_bench(config, data, out, report)
         report.stage("drawing")

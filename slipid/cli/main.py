@@ -32,7 +32,7 @@ from slipid.cli.validate import validate
 
 app = typer.Typer(
     name="slipid",
-    help="Identify motors, floors and wheel loads of a robot from its logs.",
+    help="Identify the motors, floor friction and wheel loads of a robot from its logs.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -45,7 +45,7 @@ for command in (
     app.command(command.__name__.rstrip("_"))(command)  # `map_` is named so because of Python's map
 
 AGAIN_S = 0.05
-"""Delay after which an interrupt that Python had to ignore is sent again [s]."""
+"""Delay before an interrupt that Python ignored is sent again [s]."""
 
 
 def main() -> None:
@@ -55,14 +55,14 @@ def main() -> None:
 
 
 def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
-    """Send an interrupt again if Python had to ignore it.
+    """Send an interrupt again if Python ignored it.
 
     Python ignores it if it arrives in a finaliser or in a callback of the garbage collector (jax
     has one), where no exception can be raised.
     """
     if lost.exc_type is KeyboardInterrupt:
         again = threading.Timer(AGAIN_S, _thread.interrupt_main)
-        again.daemon = True  # so that a command that ends does not wait for the timer
+        again.daemon = True  # The program can exit without waiting for a daemon thread.
         again.start()
     else:
         sys.__unraisablehook__(lost)

@@ -18,35 +18,39 @@ PROPOSAL = "palette.toml"
 
 @guarded
 def map_(
-    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Picture of the floor, or video.")],
+    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Picture or video of the floor.")],
     out: Out,
-    camera: Annotated[Path, option("FILE", "Camera that `slipid calibrate` wrote.")],
+    camera: Annotated[Path, option("FILE", "Camera file of `slipid calibrate`.")],
     config: Annotated[
-        Path | None, option("FILE", "Surfaces by colour or by points, region, masks.")
+        Path | None,
+        option("FILE", "Config of the map: surfaces by colour or points, region, masks."),
     ] = None,
     surfaces: Annotated[
         int | None, option("N", "Number of surfaces to propose.", min=1, max=40)
     ] = None,
     cell: Annotated[
-        float | None, option("M", "Edge of a cell; a pixel's by default.", min=1e-4, max=1)
+        float | None,
+        option(
+            "M", "Edge length of a map cell, in m; by default that of a pixel.", min=1e-4, max=1
+        ),
     ] = None,
     dictionary: Annotated[
-        str, option("NAME", "ArUco dictionary of the robot's marker.")
+        str, option("NAME", "ArUco dictionary of the robot's marker, to mask the robot.")
     ] = "4X4_50",
     robot_radius: Annotated[
-        float, option("M", "Radius of the robot, which is masked.", min=0, max=10)
+        float, option("M", "Radius of the masked disc around the robot, in m.", min=0, max=10)
     ] = 0.2,
     marker_height: Annotated[
-        float, option("M", "Height of the marker above the floor.", min=0, max=10)
+        float, option("M", "Height of the marker above the floor, in m.", min=0, max=10)
     ] = 0.25,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Map the surfaces of a floor from one picture from above; needs slipid\[camera].
+    r"""Make a map of the surfaces of a floor from one picture from above; needs slipid\[camera].
 
-    Without a config it proposes surfaces and writes a palette.toml, in which to rename them before
-    the next run. It writes map.geojson, which every option for a map takes, and a picture to check
-    it. The exit code is 1 where the map is poor.
+    Without a config, the command proposes surfaces and writes them to palette.toml; rename them
+    there and run the command again with --config. It writes map.geojson, the format of all options
+    for maps, and a picture of the map for checking. The exit code is 1 if the map is poor.
     """
     from slipid.camera.floor.grid import RobotShape
     from slipid.camera.floor.picture import MapOptions, map_of
@@ -62,9 +66,8 @@ def map_(
         result = map_of(image, OverheadCamera.load(camera), options, report)
         if result.proposal is not None and (out / PROPOSAL).exists():
             raise DataError(
-                f"{out / PROPOSAL}: it is there already and may have been edited, and surfaces are "
-                f"to be proposed; expected --config {out / PROPOSAL} with surfaces in it, or "
-                "another folder"
+                f"{out / PROPOSAL}: exists already, and proposing surfaces would overwrite it; "
+                f"expected --config {out / PROPOSAL} with surfaces in it, or another folder"
             )
         result.vector.save(out / "map.geojson")
         floor_plot(result.vector, result.floor.colour, result.floor.in_view, out / "map.png")
@@ -89,7 +92,8 @@ def show(page: "Page", result: "PictureMap", out: Path) -> None:
         rows.add_row(one["surface"], one["colour"], str(one["patches"]), area, share, confidence)
     page.table(rows)
     page.line(
-        "confidence: how much worse, in spreads, the next best surface explains the weakest patch"
+        "confidence: how much worse the second best surface explains the least certain patch, in "
+        "standard deviations of its colour"
     )
     for robot in result.robots:
         page.line(
@@ -101,5 +105,7 @@ def show(page: "Page", result: "PictureMap", out: Path) -> None:
     for sentence in result.poor:
         page.line(f"poor: {sentence}")
     if result.proposal is not None:
-        page.line(f"surfaces are proposed: rename or join them in {out / PROPOSAL}, then add")
+        page.line(
+            f"these surfaces are a proposal: rename or merge them in {out / PROPOSAL}, then add"
+        )
         page.line(f"  --config {out / PROPOSAL}")

@@ -15,27 +15,39 @@ _column = partial(option, "NAME[:UNIT]")
 
 @guarded
 def motor(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Log, a CSV or Parquet file.")],
-    time: Annotated[Column, _column("Column of the time, in s.")] = None,
-    voltage: Annotated[Column, _column("Voltage across the motor, in V.")] = None,
-    current: Annotated[Column, _column("Current in A; I:mA for others.")] = None,
-    speed: Annotated[Column, _column("Speed of the shaft, in rad/s; w:rpm for others.")] = None,
-    angle: Annotated[Column, _column("Angle of the shaft, in rad, for the speed.")] = None,
-    duty: Annotated[Column, _column("Share of the bus voltage; d:% too.")] = None,
-    bus: Annotated[Column, _column("Bus voltage, with --duty, in V.")] = None,
-    unsigned: Annotated[bool, flag("--unsigned", "The current is a magnitude.")] = False,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Log file (CSV or Parquet).")],
+    time: Annotated[Column, _column("Column with the time, in s.")] = None,
+    voltage: Annotated[Column, _column("Column with the voltage across the motor, in V.")] = None,
+    current: Annotated[
+        Column, _column("Column with the current, in A; other units as I:mA.")
+    ] = None,
+    speed: Annotated[
+        Column, _column("Column with the shaft speed, in rad/s; other units as w:rpm.")
+    ] = None,
+    angle: Annotated[
+        Column, _column("Column with the shaft angle, in rad, instead of the speed.")
+    ] = None,
+    duty: Annotated[
+        Column, _column("Column with the duty cycle, instead of the voltage; d:% for percent.")
+    ] = None,
+    bus: Annotated[Column, _column("Column with the bus voltage, in V; with --duty.")] = None,
+    unsigned: Annotated[
+        bool, flag("--unsigned", "The logged current is a magnitude without sign.")
+    ] = False,
     delimiter: Annotated[
-        str | None, option("CHARACTER", "Text between cells; guessed by default.")
+        str | None, option("CHARACTER", "Character between cells; guessed by default.")
     ] = None,
     out: MaybeOut = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Identify a motor's resistance, back-EMF, friction and inertia from voltage, current, speed.
+    """Identify a motor on a bench from its log: resistance, back-EMF, friction and inertia.
 
-    Columns that are not named are guessed. Several motors: names by commas. The speed must be that
-    of the motor shaft: no log shows that it was taken behind a gear. With --out it writes
-    motor.json and a picture. Exit code 1 where the model does not explain the log.
+    The log needs the voltage, current and speed of the motor. Columns that are not given are found
+    by their names. For several motors, separate their columns by commas. The speed must be that of
+    the motor shaft; a speed measured behind a gear cannot be detected and gives wrong results. With
+    --out, the command writes motor.json and a picture. The exit code is 1 if the model does not
+    explain the log.
     """
     from slipid.app.bench import read_motor_log
     from slipid.data.reading.motor_layout import given_columns

@@ -21,43 +21,56 @@ def _text(words: str, panel: str | None = None) -> object:
 
 @guarded
 def new(
-    out: Annotated[Path, option("FILE", "Config to write.")] = Path("robot.toml"),
+    out: Annotated[Path, option("FILE", "Config file to write.")] = Path("robot.toml"),
     log: Annotated[
         Path | None,
         option(
-            "LOG", "A log (CSV, Parquet, bag) or a folder of logs to read; asks nothing.", "--from"
+            "LOG",
+            "Log (CSV, Parquet, bag) or folder of logs to read, instead of asking questions.",
+            "--from",
         ),
     ] = None,
-    drive: Annotated[Text, _text("omni, mecanum, skid, differential or general.")] = None,
+    drive: Annotated[
+        Text,
+        _text(
+            "Type of the wheels: Type of the wheels: omni, mecanum, skid, differential or general."
+        ),
+    ] = None,
     wheel_radius_m: Annotated[Text, _text("Wheel radius.")] = None,
     gear_ratio: Annotated[Text, _text("Motor turns per wheel turn.")] = None,
     mass_kg: Annotated[Text, _text("Mass of the robot.")] = None,
     ticks_per_revolution: Annotated[
-        Text, _text("Encoder ticks per motor turn; 0 where none are logged.")
+        Text, _text("Encoder ticks per motor turn; 0 if no ticks are logged.")
     ] = None,
-    wheelbase_m: Annotated[Text, _text("Front to rear axle.", _BOX)] = None,
+    wheelbase_m: Annotated[Text, _text("Distance between front and rear axle.", _BOX)] = None,
     track_m: Annotated[
-        Text, _text("Between left and right wheels; also of a differential drive.", _BOX)
+        Text, _text("Distance between left and right wheels; also for a differential drive.", _BOX)
     ] = None,
     shared: Annotated[
-        Text, _text("yes where one motor turns both wheels of a side, else no.", _BOX)
+        Text, _text("yes if one motor drives both wheels of a side, else no.", _BOX)
     ] = None,
     wheels: Annotated[Text, _text("Number of omni wheels.", _WHEELS)] = None,
-    azimuths_deg: Annotated[Text, _text("Where omni wheels stand, as 60,180,300.", _WHEELS)] = None,
-    base_radius_m: Annotated[Text, _text("Omni wheels' centres from the middle.", _WHEELS)] = None,
+    azimuths_deg: Annotated[
+        Text, _text("Directions of the omni wheels from the middle, such as 60,180,300.", _WHEELS)
+    ] = None,
+    base_radius_m: Annotated[
+        Text, _text("Distance of the omni wheels from the middle.", _WHEELS)
+    ] = None,
     places_m: Annotated[
-        Text, _text("General: x,y of the wheels, as '0.2,0.1; 0.2,-0.1'.", _WHEELS)
+        Text, _text("General: x,y of the wheels, such as '0.2,0.1; 0.2,-0.1'.", _WHEELS)
     ] = None,
     directions_deg: Annotated[
-        Text, _text("General: directions of the wheels, as 0,0.", _WHEELS)
+        Text, _text("General: drive directions of the wheels, such as 0,0.", _WHEELS)
     ] = None,
-    rollers_deg: Annotated[Text, _text("General: rollers to these, as 45,none.", _WHEELS)] = None,
+    rollers_deg: Annotated[
+        Text, _text("General: angles of the rollers to these directions, such as 45,none.", _WHEELS)
+    ] = None,
     yes: Annotated[
-        bool, flag("--yes", "Ask nothing: take defaults, marked in the config.")
+        bool, flag("--yes", "Do not ask: use defaults, which are marked in the config.")
     ] = False,
     force: Annotated[bool, flag("--force", "Overwrite.")] = False,
 ) -> int:
-    """Write a commented config for your robot: asks for it, or reads its logs (--from)."""
+    """Write a commented config for your robot, from your answers to questions or from its logs."""
     # Every argument that is a text describes the robot.
     options = {name: text for name, text in locals().items() if isinstance(text, str)}
 
@@ -87,8 +100,8 @@ def _ask(asks: str, default: str, wrong: str) -> str:
 
     Args:
         asks: the question.
-        default: answer if the user only presses Enter.
-        wrong: message about what is wrong with the previous answer; empty for the first.
+        default: answer that is used if the user only presses Enter.
+        wrong: error message about the previous answer; empty for the first question.
 
     Raises:
         DataError: there is no answer, because the input has ended.
@@ -103,7 +116,7 @@ def _ask(asks: str, default: str, wrong: str) -> str:
         if wrong:
             raise DataError(f"{asks}: {wrong}") from None
         raise DataError(
-            f"{asks}: no answer; expected one, an option with it (slipid new --help), "
+            f"{asks}: no answer; expected an answer, an option that gives it (slipid new --help), "
             "or --yes for the defaults"
         ) from None
 
@@ -119,5 +132,5 @@ def _show(config: "NewConfig", out: Path, data: str) -> None:
     else:
         typer.echo(f"{out} is complete; run")
     typer.echo(f"  slipid check {out} --data {data}")
-    typer.echo("or, before anything is driven, see what a plan of runs would identify:")
+    typer.echo("or, before driving, simulate which parameters a plan of runs would identify:")
     typer.echo(f"  slipid selftest {out}")

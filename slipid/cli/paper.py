@@ -1,4 +1,4 @@
-"""`slipid paper`: regenerate the tables and figures of the 2021 paper from its own data."""
+"""`slipid paper`: regenerate the tables and figures of the 2021 paper from the paper's data."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,10 +10,10 @@ from slipid.cli.common import Out, guarded, option
 
 @guarded
 def paper(
-    data: Annotated[Path, option("DIR", "Folder that holds robotino2021.")],
+    data: Annotated[Path, option("DIR", "Folder that contains the folder robotino2021.")],
     out: Out,
 ) -> int:
-    """Regenerate the 2021 paper's tables and figures from its own data."""
+    """Regenerate the tables and figures of the 2021 paper from the paper's data."""
     from slipid.lab.paper2021.plots import run
 
     for path in run(data, out):

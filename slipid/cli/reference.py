@@ -1,4 +1,4 @@
-"""`slipid reference`: print every key of a config, from the models that check configs."""
+"""`slipid reference`: print every key of a config, from the code that checks configs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,10 +18,10 @@ def reference(
         ),
     ] = None,
     config: Annotated[
-        Path | None, option("CONFIG", "Parameters of this robot and its choices.")
+        Path | None, option("CONFIG", "Config of the robot whose parameters are listed.")
     ] = None,
 ) -> int:
-    """Print every key, channel, unit and parameter, with its default and its meaning (Markdown)."""
+    """Print every key, channel, unit and parameter of configs, with meanings (Markdown)."""
     from slipid.app.config import read_config
     from slipid.app.reference.page import reference
 

@@ -13,17 +13,29 @@ from slipid.support.progress import Reporter
 @for_robots
 def sample(
     out: OutFolder,
-    data: Annotated[Path | None, option("DIR", "Folder of the logs, if it moved.")] = None,
-    draws: Annotated[int, typer.Option(min=10, help="Draws kept of each of four ensembles.")] = 400,
-    most: Annotated[int, typer.Option(min=40, help="Largest number of blocks.")] = 400,
+    data: Annotated[
+        Path | None, option("DIR", "Folder of the logs, if it was moved since the fit.")
+    ] = None,
+    draws: Annotated[
+        int,
+        typer.Option(
+            min=10, help="Number of draws to keep from each of the four ensembles of chains."
+        ),
+    ] = 400,
+    most: Annotated[int, typer.Option(min=40, help="Largest number of blocks of steps.")] = 400,
     block: Annotated[
-        int, typer.Option(min=1, hidden=True, help="Steps that are kept together.")
+        int,
+        typer.Option(
+            min=1,
+            hidden=True,
+            help="Number of steps per block; the chain is saved after each block.",
+        ),
     ] = 20,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Sample the posterior of a fit by emcee for honest intervals; continues after an interrupt."""
+    """Sample the posterior of a fit with emcee, for more exact intervals."""
     from slipid.report.estimates import show_sample
     from slipid.support.files import read_json
 
@@ -34,13 +46,13 @@ def sample(
         from slipid.infer.posterior.blocks import Plan
         from slipid.plots.posterior import posterior_plots
     except ImportError as error:
-        raise DataError(f"{error}; expected `pip install slipid[posterior]`") from error
+        raise DataError(f"{error}; install it by `pip install slipid[posterior]`") from error
     with Reporter(quiet=quiet) as report:
         posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
         robot = write_robot(out, posterior)
         report.stage("drawing")
         drawn = posterior_plots(posterior, out)
-    content = read_json(out / "identified.json", "what sample wrote")
+    content = read_json(out / "identified.json", "a result of `slipid sample`")
     shown = posterior.parameters.values(), about, content["messages"]
     written = (*WRITTEN, *robot, *(path.name for path in drawn))
     emit(json, content, lambda page: show_sample(page, *shown), out, written)

@@ -12,17 +12,20 @@ from slipid.support.progress import Reporter
 @for_robots
 def selftest(
     config: ConfigFile,
-    data: Annotated[Path | None, option("DIR", "Logs whose wheel motion is taken, if any.")] = None,
+    data: Annotated[
+        Path | None, option("DIR", "Folder of logs whose wheel motion is used in the simulation.")
+    ] = None,
     out: Out = Path("selftest_out"),
     replicates: Annotated[int, typer.Option(min=1, help="Number of simulated experiments.")] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of truths and noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random true values and noise.")] = 0,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Simulate this very experiment with known truth, fit it, and report what it recovers.
+    r"""Simulate the experiment with known true values, fit it, and compare the result with them.
 
-    Without --data it is the plan of \[selftest] in the config. Writes selftest.json; goes on from
-    the replicates that are done. Exit code 1 where a wanted number is not recovered.
+    Without --data, the runs are those planned in \[selftest] of the config. Writes selftest.json.
+    After an interrupt, finished simulations are kept. The exit code is 1 if a parameter that should
+    be recovered is not.
     """
     from slipid.lab.selftest.experiment import selftest as run
     from slipid.report.estimates import show_selftest

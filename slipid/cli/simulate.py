@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 def simulate(
     config: ConfigFile, out: Out, jobs: Jobs = None, json: Json = None, quiet: Quiet = False
 ) -> int:
-    r"""Make logs on the virtual test site, whose physics is MuJoCo's; needs slipid\[testsite].
+    r"""Simulate logs on the virtual test site (MuJoCo physics); needs slipid\[testsite].
 
-    Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
-    Runs that are done are kept and not driven again.
+    Writes the logs, a config for `slipid identify`, floor maps, and, in a separate folder, the true
+    values. Finished runs are kept and not simulated again.
     """
     from slipid.lab.testsite.config import plan as read
     from slipid.lab.testsite.simulate import simulate as run
@@ -36,10 +36,10 @@ def show(page: "Page", found: Content, plan: "SimulationPlan", out: Path) -> Non
     """Print the number and duration of the simulated runs, and the next commands."""
     from slipid.lab.testsite.config import can_identify
 
-    page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
+    page.line(f"{len(found['runs'])} runs, {found['driven']} of them simulated now")
     if found["pace"] is not None:
         page.line(f"{found['seconds']:.0f} s at {found['pace']:.1f} times real time")
-    page.line(f"truth, which no fit reads: {out / 'truth'}")
+    page.line(f"true values, which no fit reads: {out / 'truth'}")
     if can_identify(plan):
         page.line(
             f"  slipid identify {out / 'robot.toml'} --data {out / 'logs'} --out {out / 'result'}"

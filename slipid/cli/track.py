@@ -19,46 +19,61 @@ def track(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="VIDEO|FOLDER|DEVICE", help="Video, pictures, or a camera's number."
+            metavar="VIDEO|FOLDER|DEVICE", help="Video, pictures, or the number of a camera device."
         ),
     ],
-    camera: Annotated[Path, option("FILE", "Camera that slipid calibrate wrote.")],
-    out: Annotated[Path, option("FILE", "Poses: .csv or .parquet.")],
+    camera: Annotated[Path, option("FILE", "Camera file of `slipid calibrate`.")],
+    out: Annotated[Path, option("FILE", "File of poses to write (.csv or .parquet).")],
     marker_size: Annotated[
-        float | None, option("M", "Edge of the marker's black square, in m.")
+        float | None, option("M", "Edge length of the marker's black square, in m.")
     ] = None,
     marker_height: Annotated[
         float | None, option("M", "Height of the marker above the floor, in m.")
     ] = None,
     marker_yaw: Annotated[
-        float, option("DEG", "Angle of its top edge, counter-clockwise from ahead.")
+        float,
+        option(
+            "DEG",
+            "Direction of the marker's top edge, in deg counter-clockwise from the robot's x axis.",
+        ),
     ] = 0.0,
-    dictionary: Annotated[str, option("NAME", "Dictionary of the marker.")] = "4X4_50",
+    dictionary: Annotated[str, option("NAME", "Name of the dictionary of the marker.")] = "4X4_50",
     id: Annotated[
-        int | None, typer.Option(min=0, help="Number of the marker; the only one by default.")
+        int | None,
+        typer.Option(min=0, help="Number of the marker; by default the only one that is seen."),
     ] = None,
     targets: Annotated[
-        Path | None, option("FILE", "Several markers, boards or robots, instead of these.")
+        Path | None,
+        option(
+            "FILE", "Config of several markers, boards or robots, instead of the marker options."
+        ),
     ] = None,
-    fps: Annotated[float | None, option("HZ", "Frame rate; by default the video's times.")] = None,
+    fps: Annotated[
+        float | None, option("HZ", "Frame rate, in Hz; by default the times in the video are used.")
+    ] = None,
     times: Annotated[
-        Path | None, option("FILE", "Times of the frames: CSV of frame, time.")
+        Path | None, option("FILE", "CSV file of the frame times, with columns frame and time [s].")
     ] = None,
-    region: Annotated[str | None, option("X0,Y0,X1,Y1", "Only this part, in pixels.")] = None,
+    region: Annotated[
+        str | None, option("X0,Y0,X1,Y1", "Part of the picture in which to search, in pixels.")
+    ] = None,
     seconds: Annotated[
-        float | None, option("S", "Duration of a recording from a device, which needs it.")
+        float | None, option("S", "Duration of the recording in s; required for a camera device.")
     ] = None,
-    preview: Annotated[Path | None, option("FILE", "Also draw one frame, to check by eye.")] = None,
+    preview: Annotated[
+        Path | None, option("FILE", "Picture to write, with the poses of one frame drawn in it.")
+    ] = None,
     preview_frame: Annotated[
-        int | None, option("N", "Which frame; by default the first with a pose.", min=0)
+        int | None, option("N", "Number of this frame; by default the first with a pose.", min=0)
     ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
     """Track a robot with a marker in the video of a calibrated camera above it.
 
-    Every frame has a row with pose and covariance, or with the reason why it was rejected; nothing
-    is interpolated. The exit code is 1 where the poses should not be used as they are.
+    The file has a row for every frame, with the pose and its covariance, or with the reason why the
+    frame was rejected; nothing is interpolated. The exit code is 1 if the poses are too poor to be
+    used unchanged.
     """
     from slipid.camera.frame_source import open_source
     from slipid.camera.overhead import OverheadCamera
@@ -76,11 +91,11 @@ def track(
             bodies = read_targets(targets)
         elif marker_size is None or marker_height is None:
             raise DataError(
-                "no size or no height of the marker; expected --marker-size and --marker-height in "
-                "metres, or --targets FILE"
+                "the size or the height of the marker is missing; expected --marker-size and "
+                "--marker-height in metres, or --targets FILE"
             )
         else:
-            report.stage("looking for the marker")
+            report.stage("searching for the marker")
             yaw = math.radians(marker_yaw)
             lone = tracking.LoneMarker(marker_size, marker_height, id, dictionary, yaw)
             bodies = (lone.target(frames, part),)

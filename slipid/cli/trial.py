@@ -1,4 +1,4 @@
-"""`slipid trial`: drive the 2021 paper's rectangle, or another path, with every controller."""
+"""`slipid trial`: drive the rectangle of the 2021 paper, or another path, with every controller."""
 
 from pathlib import Path
 from typing import Annotated
@@ -24,31 +24,36 @@ from slipid.support.progress import Reporter
 def trial(
     out: OutFolder,
     plant: Annotated[
-        str, option("NAME", "testsite (MuJoCo), or twin: the fit itself.")
+        str, option("NAME", "Simulated robot: testsite (MuJoCo), or twin (the fitted model).")
     ] = "testsite",
-    map: Annotated[Path | None, option("FILE", "Floor map; else made of patches.")] = None,
+    map: Annotated[
+        Path | None, option("FILE", "Floor map; by default patches of the fitted floors.")
+    ] = None,
     told_map: Annotated[
         Path | None,
-        option("FILE", "Map that is given to controllers with a map; the true one by default."),
+        option("FILE", "Map for the controllers that use one; by default the true map."),
     ] = None,
-    controllers: Annotated[str | None, option("NAMES", "By commas; all by default.")] = None,
+    controllers: Annotated[
+        str | None, option("NAMES", "Controllers separated by commas; all by default.")
+    ] = None,
     path: Annotated[
-        str, option("NAME", "rectangle, circle, eight, or turning: it turns.")
+        str, option("NAME", "Path: rectangle, circle, eight, or turning (the robot also rotates).")
     ] = "rectangle",
-    speed: Annotated[float, option("M_S", "Along the path, in m/s.")] = 0.2,
-    starts: Annotated[int, typer.Option(min=1, max=99, help="Poses to start from.")] = 20,
+    speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
+    starts: Annotated[int, typer.Option(min=1, max=99, help="Number of start poses.")] = 20,
     load: Load = None,
     tuned_gains: Annotated[
-        bool, flag("--tuned-gains", "Even where they are no better than by hand.")
+        bool,
+        flag("--tuned-gains", "Use tuned gains even if they are no better than those set by hand."),
     ] = False,
     jobs: Jobs = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Drive the 2021 paper's rectangle, or another path, with every controller, and judge them.
+    """Drive a simulated robot along a path with every controller, and compare their errors.
 
-    Gains are those set by hand, or tuned ones of an older robot.json that are better. Writes
-    trial.json and trial.png to OUT; runs that are done are kept and not driven again.
+    The gains are those set by hand, or the tuned gains of an older robot.json if these are better.
+    Writes trial.json and trial.png to OUT. Finished runs are kept and not simulated again.
     """
     from slipid.lab.trial.plots import trial_plot
     from slipid.lab.trial.trial import TrialOptions, controller_names

@@ -1,4 +1,4 @@
-"""`slipid validate`: predict runs open loop with a fit, and compare them with their poses."""
+"""`slipid validate`: predict runs open loop with a fit, and compare with the logged poses."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from slipid.support.progress import Reporter
 
 @for_robots
 def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet = False) -> int:
-    """Predict runs open loop and compare with the camera, model by model."""
+    """Predict runs open loop with the fit and with simpler models; compare with logged poses."""
     from slipid.report.estimates import show_validation
 
     with Reporter(quiet=quiet) as report:

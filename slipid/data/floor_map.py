@@ -27,11 +27,12 @@ MOST_CELLS = 16_000_000
 
 @dataclass(frozen=True, eq=False)
 class FloorMap:
-    """A rectangular floor of square cells, each of which has one surface.
+    """Map of a rectangular floor, made of square cells with one surface each.
 
     Attributes:
-        surfaces: names of the surfaces; `cells` numbers them from 0.
-        cells: number of each cell's surface; the first row has the lowest y.
+        surfaces: names of the surfaces.
+        cells: index in `surfaces` of the surface of each cell; the first row of cells has the
+            lowest y.
         corner: x, y of the corner with the lowest coordinates [m].
         cell: edge length of a cell [m].
     """
@@ -43,15 +44,15 @@ class FloorMap:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Return lowest x, lowest y, highest x and highest y [m]."""
+        """Lowest x, lowest y, highest x and highest y of the floor [m]."""
         rows, columns = self.cells.shape
         x, y = self.corner
         return x, y, x + columns * self.cell, y + rows * self.cell
 
     def at(self, xy: Float[np.ndarray, "*batch 2"]) -> Int[np.ndarray, "*batch"]:
-        """Return the number of the surface at places x, y [m].
+        """Return the index of the surface at places x, y [m].
 
-        A place outside the map has the surface of the nearest cell at the map's edge.
+        For a place outside the map, the nearest cell at the edge of the map is used.
         """
         steps = np.floor((np.asarray(xy) - self.corner) / self.cell).astype(np.intp)
         rows, columns = self.cells.shape
@@ -150,7 +151,9 @@ def four_zones(surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.
 def _few(cells: int) -> None:
     """Raise `ValueError` if a map would have more than `MOST_CELLS` cells."""
     if cells > MOST_CELLS:
-        raise ValueError(f"{cells} cells; expected at most {MOST_CELLS}: a larger cell, less floor")
+        raise ValueError(
+            f"{cells} cells; expected at most {MOST_CELLS}; use larger cells or a smaller floor"
+        )
 
 
 class PatchTable(Section):
@@ -203,7 +206,8 @@ def read_map(path: Path) -> FloorMap:
         x0, y0, x1, y1 = given.extent_m
         if not (x0 < x1 and y0 < y1):
             raise DataError(
-                f"{path}: extent_m {given.extent_m}; expected lowest x, y, then highest x, y"
+                f"{path}: extent_m {given.extent_m}; expected lowest x, lowest y, highest x, "
+                "highest y"
             )
         patches = [(patch.surface, patch.polygon) for patch in given.patch]
         return from_polygons(given.base, patches, given.extent_m, given.cell_m)
@@ -223,7 +227,10 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
 
     table = np.array([to_rgb(colours[name]) for name in floor.surfaces])
     if len(np.unique(table, axis=0)) < len(table):
-        raise ValueError(f"surfaces with the same colour: {dict(colours)}; expected others")
+        raise ValueError(
+            f"surfaces with the same colour: {dict(colours)}; expected a different colour for "
+            "each surface"
+        )
     picture = BytesIO()
     imsave(picture, table[floor.cells[::-1]], format="png")
     write_bytes(path.with_suffix(".png"), picture.getvalue())

@@ -1,6 +1,7 @@
 """Floor maps as polygons in a GeoJSON file, with coordinates in metres instead of degrees.
 
-Parts of the floor in no polygon are unknown; read as a floor map they get the nearest surface.
+Parts of the floor outside all polygons are unknown; in a floor map read from the file they get the
+nearest surface.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from slipid.support.errors import bad_data
 from slipid.support.files import read_json, write_json
 from slipid.support.toml_file import Section, checked
 
-WHAT = "a floor map (slipid.map/2) that `slipid map` wrote"
+EXPECTED = "a floor map (slipid.map/2) that `slipid map` wrote"
 DIGITS = 5
 """Decimal places of the written coordinates [m]: they are rounded to 0.01 mm."""
 Place = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
@@ -44,7 +45,7 @@ class Patch:
 
 
 class MapRegion(Section):
-    """The object `slipid` of a map file: everything but the patches.
+    """Content of the object `slipid` of a map file: everything except the patches.
 
     Attributes:
         schema_: schema of the file.
@@ -75,11 +76,11 @@ class VectorMap:
     region: MapRegion
 
     def save(self, path: Path) -> None:
-        """Write the map as a GeoJSON file; raise `DataError` where it cannot be written."""
+        """Write the map as a GeoJSON file; raise `DataError` if it cannot be written."""
         write_json(path, self.to_json())
 
     def to_json(self) -> Content:
-        """Return a GeoJSON FeatureCollection of the patches, all else under the key `slipid`."""
+        """Return a GeoJSON FeatureCollection of the patches, with the region under `slipid`."""
         region = self.region.model_dump(mode="json", by_alias=True)
         region["extent_m"] = [round(bound, DIGITS) for bound in self.region.extent_m]
         features = [self._feature(patch) for patch in self.patches]
@@ -118,7 +119,7 @@ class _Feature(Section):
 
 
 class _GeojsonFile(Section):
-    """Content of a GeoJSON map file, as it is checked when read."""
+    """Schema of a GeoJSON map file, against which files are checked."""
 
     type: Literal["FeatureCollection"]
     slipid: MapRegion
@@ -134,11 +135,11 @@ def read_polygons(path: Path) -> FloorMap:
     """
     from scipy.ndimage import distance_transform_edt
 
-    given = checked(path, read_json(path, WHAT), _GeojsonFile)
+    given = checked(path, read_json(path, EXPECTED), _GeojsonFile)
     region = given.slipid
     low_x, low_y, high_x, high_y = region.extent_m
     if not (low_x < high_x and low_y < high_y):
-        expected = "lowest x, y, then highest x, y"
+        expected = "lowest x, lowest y, highest x, highest y"
         raise bad_data(path, f"extent_m {region.extent_m}", expected)
     names = tuple(region.colours)
     surfaces = {feature.properties.surface for feature in given.features} | {region.base}
@@ -167,8 +168,8 @@ def covered(
 ) -> Bool[np.ndarray, "row column"]:
     """Return whether the centre of each cell lies within an odd number of rings.
 
-    Coordinates of the rings count cells: x in columns, y in rows. In each row, every edge of a ring
-    flips all cells to its right between outside and inside.
+    Coordinates of the rings are in cells: x in columns, y in rows. In each row, every edge of a
+    ring switches all cells to its right between outside and inside.
     """
     turns = np.zeros((rows, columns + 1), np.intp)
     for ring in rings:

@@ -11,13 +11,13 @@ from slipid.data.align.clock import Clock
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Log:
-    """One run; all its arrays have a row for each time at which some sensor was read.
+    """One run; all arrays have a row for each time at which at least one sensor was read.
 
-    Where several wheels share a motor, a "wheel" stands for that motor with all its wheels.
+    If several wheels share a motor, "wheel" stands for that motor with all its wheels.
 
     Attributes:
-        name: path relative to the data root, with forward slashes; `#03` follows where one file
-            holds several runs.
+        name: path relative to the data root, with forward slashes; if a file contains several runs,
+            a suffix such as `#03` is added.
         path: path of the file.
         sha256: SHA-256 hash of the file's bytes.
         time: time [s], strictly increasing; it starts at 0 if the logged clock counts from 1970.
@@ -71,17 +71,17 @@ class Log:
 
     @property
     def samples(self) -> int:
-        """Return the number of rows."""
+        """Number of rows."""
         return len(self.time)
 
     @property
     def wheels(self) -> int:
-        """Return the number of wheels, 0 if only poses were logged."""
+        """Number of wheels, 0 if only poses were logged."""
         return self.wheel_angle.shape[1]
 
     @property
     def duration(self) -> float:
-        """Return the time from the first to the last row [s]."""
+        """Time from the first to the last row [s]."""
         return float(self.time[-1] - self.time[0])
 
     def __repr__(self) -> str:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.data.log import Log
 from slipid.data.wheel_signals import (
-    MOVED,
+    MOVED_M,
     bridge_stalls,
     first_moved,
     read_anew,
@@ -20,7 +20,7 @@ from slipid.support.errors import DataError
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Runs laid end to end: each array holds the samples of all runs, one run after another.
+    """A set of runs; each array contains the samples of all runs, one run after another.
 
     Attributes:
         logs: the runs; their arrays are views of the flat ones below, except for the raw wheel
@@ -37,9 +37,9 @@ class Runs:
         voltage_fresh: False where a voltage repeats the last reading (sample, wheel), or None.
         current_is_signed: False if some log has only magnitudes of currents.
         session: name of each run's session, in which the marker stayed in place.
-        heading: commanded direction of travel of each run [rad]; nan where it turns on the spot.
-        speed: commanded speed of each run [m/s]; nan where no command was logged.
-        turn: commanded yaw rate of each run [rad/s]; nan where no command was logged.
+        heading: commanded direction of travel of each run [rad]; nan if it turns on the spot.
+        speed: commanded speed of each run [m/s]; nan if no command was logged.
+        turn: commanded yaw rate of each run [rad/s]; nan if no command was logged.
         aside: one line about each run that was left out because its pose jumps.
     """
 
@@ -80,7 +80,7 @@ class Runs:
             DataError: a run is in both sets, or the numbers of wheels differ.
         """
         if both := {log.name for log in self.logs} & {log.name for log in other.logs}:
-            raise DataError(f"{min(both)}: in both sets of runs; expected it once")
+            raise DataError(f"{min(both)}: in both sets of runs; expected every run only once")
         aside = [*self.aside, *other.aside]
         return collect([*self.logs, *other.logs], [*self.session, *other.session], aside)
 
@@ -88,7 +88,7 @@ class Runs:
 def collect(
     logs: Sequence[Log], session: Sequence[str] | None = None, aside: Sequence[str] = ()
 ) -> Runs:
-    """Return runs, all of which have wheels and poses, as one set.
+    """Return runs with wheels and poses as one set.
 
     Args:
         logs: the runs.
@@ -108,9 +108,7 @@ def collect(
                 f"{log.name}: {log.wheels} wheels; expected {logs[0].wheels}, as in {logs[0].name}"
             )
         if log.pose is None:
-            raise DataError(
-                f"{log.name}: no pose; expected the columns of a camera, which a fit needs"
-            )
+            raise DataError(f"{log.name}: no pose; expected pose columns, which a fit needs")
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
     heading, speed, turn = np.array([_command(log) for log in logs]).T
     bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]
@@ -125,7 +123,7 @@ def collect(
     )
 
     def view(k: int, log: Log) -> Log:
-        """Return a run with views of the flat arrays; a bridged one keeps its raw wheel angle."""
+        """Return a run with views of the flat arrays; with stalls it keeps its raw wheel angle."""
         views: dict[str, Any] = {n: a[offset[k] : offset[k + 1]] for n, a in flat.items()}
         if bridged[k][0] is not log.wheel_angle:
             del views["wheel_angle"]
@@ -164,12 +162,12 @@ def _fresh(logs: Sequence[Log], channel: str) -> Bool[np.ndarray, "sample wheel"
 
 
 def counted_once(logs: Sequence[Log]) -> list[Log]:
-    """Return the logs with `current_fresh` False where a current only repeats the last reading.
+    """Return the logs with `current_fresh` False in rows that only repeat the last current reading.
 
     The refresh period of each ammeter is estimated from all runs together, because a short run has
     too few changes: an ammeter read once a second changes only six times in six seconds. Voltages
-    are not checked: a voltage that a test bench or a program sets stays constant between its steps,
-    although it is read in every row.
+    are not checked: a voltage that is set by a test bench or a program stays constant between its
+    steps, although it is read in every row.
     """
     have = [k for k, log in enumerate(logs) if log.current is not None]
     wheels = max((logs[k].wheels for k in have), default=0)
@@ -188,7 +186,7 @@ def counted_once(logs: Sequence[Log]) -> list[Log]:
             rows = _rows_read(out[k], wheel)
             fresh[rows, wheel] &= read_anew(*_readings(out[k], rows, wheel), period)
         listed = ", ".join(sorted({f"{p:.2g}" for p in periods.values()}))
-        note = f"current is read anew every {listed} s: between, it repeats and is not counted"
+        note = f"the current is refreshed every {listed} s: repeated values in between are ignored"
         out[k] = replace(out[k], current_fresh=fresh, notes=(*out[k].notes, note))
     return out
 
@@ -228,7 +226,7 @@ def _command(log: Log) -> tuple[float, float, float]:
 
 
 def first_row(data: Runs, run: int, wheel_radius: float) -> int:
-    """Return the first row of a run by which the rim of some wheel has moved `MOVED`.
+    """Return the first row of a run by which the rim of some wheel has moved `MOVED_M`.
 
     Raises:
         DataError: no rim moves that far in the run.
@@ -236,7 +234,7 @@ def first_row(data: Runs, run: int, wheel_radius: float) -> int:
     first = first_moved(data.wheel_angle[data.rows(run)], wheel_radius)
     if first is None:
         raise DataError(
-            f"{data.logs[run].name}: no wheel moves {MOVED * 1000:.0f} mm; "
-            "expected a run in which the robot drives"
+            f"{data.logs[run].name}: no wheel rim moves by {MOVED_M * 1000:.0f} mm; expected a "
+            "run in which the robot drives"
         )
     return first

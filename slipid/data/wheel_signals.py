@@ -1,7 +1,7 @@
 """Functions on the signals of one run.
 
-They compute increments of motion, find the rows in which a slow sensor was read, bridge telemetry
-stalls, and find the first motion and wheels in the wrong order.
+They compute increments of motion, find the rows in which a slow sensor was read, interpolate across
+telemetry stalls, and find the first motion and wheels in the wrong order.
 """
 
 from collections.abc import Iterable
@@ -10,18 +10,18 @@ from itertools import permutations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-MOVED = 0.010
-"""Motion starts in the row by which the fastest wheel's rim has moved this distance [m]."""
-STALLED = 3
-"""Least number of steps (from row to row) without change of any wheel angle in a stall."""
-DOUBT = 0.05
-"""Misfit of the declared order of wheels (see `swapped_order`) above which other orders are tried
-[1]; speed control errors alone cause less."""
+MOVED_M = 0.010
+"""Motion starts in the first row in which the rim of some wheel has moved by this distance [m]."""
+STALL_STEPS = 3
+"""In a telemetry stall, no wheel angle changes for at least this number of rows."""
+DOUBTFUL_MISFIT = 0.05
+"""Other orders of wheels are tried if the misfit of the declared order (see `swapped_order`)
+exceeds this [1]; errors of the speed control alone cause less."""
 LEAST_CHANGES = 8
 """Least number of changes of a sensor's value that suffices to estimate its refresh period."""
-LEAST_IN_A_RUN = 3
+LEAST_CHANGES_PER_RUN = 3
 """Least number of changes per run, on average, that suffices to estimate a refresh period."""
-BETTER = 0.25
+CLEARLY_BETTER_RATIO = 0.25
 """Another order of wheels is reported if its misfit is below this share of the declared order's
 misfit [1]."""
 
@@ -31,7 +31,7 @@ def interpolate(
     values: Float[np.ndarray, "time column"],
     at: Float[np.ndarray, " at"],
 ) -> Float[np.ndarray, "at column"]:
-    """Return columns at other times [s], interpolated linearly and constant beyond both ends.
+    """Return columns interpolated linearly at other times [s]; beyond the ends they are constant.
 
     Angles must be without wrap-around.
     """
@@ -77,7 +77,7 @@ def refresh_period(
         rows.append(np.diff(changed))
         seconds.append(np.diff(time[changed]))
     apart = np.concatenate(rows) if rows else np.zeros(0, int)
-    least = max(LEAST_CHANGES, LEAST_IN_A_RUN * count)
+    least = max(LEAST_CHANGES, LEAST_CHANGES_PER_RUN * count)
     if len(apart) < least or np.quantile(apart, 0.05) < 2:
         return None
     return float(np.median(np.concatenate(seconds)))
@@ -110,7 +110,7 @@ def body_increments(
 ) -> Float[np.ndarray, "step 3"]:
     """Return the increments ahead [m], to the left [m] and of the heading [rad] between poses.
 
-    Ahead and left are the body's axes at the mean heading of each step.
+    The axes ahead and left are those of the body at the mean heading of each step.
     """
     middle = 0.5 * (after[:, 2] + before[:, 2])
     dx, dy, turn = (after - before).T
@@ -125,18 +125,18 @@ def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
 
 
 def stretches(mask: Bool[np.ndarray, " row"]) -> Int[np.ndarray, "stretch 2"]:
-    """Return, for every stretch of consecutive True, its first row and the row after its last."""
+    """Return the first row, and the row after the last, of every sequence of consecutive True."""
     return np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2)
 
 
 def bridge_stalls(
     time: Float[np.ndarray, " time"], wheel_angle: Float[np.ndarray, "time wheel"]
 ) -> tuple[Float[np.ndarray, "time wheel"], Bool[np.ndarray, " time"]]:
-    """Return the wheel angle with telemetry stalls bridged, and whether each row is in a stall.
+    """Return the wheel angle, linear across telemetry stalls, and whether each row is in a stall.
 
     In a stall no wheel's angle changes for some rows, and then all change in one step by about the
-    missed motion: the radio link froze, not the wheels. The angle is made linear across the stall.
-    Speeds and currents reported in its rows are as outdated as the angle was.
+    missed motion: the radio link was interrupted while the wheels went on turning. Speeds and
+    currents reported in these rows are outdated, too.
     """
     stalled = np.zeros(len(time), dtype=bool)
     step = np.abs(np.diff(wheel_angle, axis=0)).max(axis=1, initial=0.0)
@@ -146,7 +146,7 @@ def bridge_stalls(
     bridged = wheel_angle
     for start, end in stretches(step == 0):
         # Rows start to end have the same angle; row end + 1 has the jump by the missed motion.
-        if end - start < STALLED or end == len(step) or start == 0:
+        if end - start < STALL_STEPS or end == len(step) or start == 0:
             continue
         if step[end] < 0.5 * (end - start + 1) * min(usual, step[start - 1]):
             continue
@@ -160,12 +160,12 @@ def bridge_stalls(
 
 
 def first_moved(wheel_angle: Float[np.ndarray, "time wheel"], radius: float) -> int | None:
-    """Return the first row by which some wheel's rim has moved `MOVED`, or None if none does.
+    """Return the first row by which some wheel's rim has moved `MOVED_M`, or None if none does.
 
     `radius` is the radius of the wheels [m].
     """
     rim = radius * np.abs(wheel_angle - wheel_angle[:1]).max(axis=1, initial=0.0)
-    moved = np.flatnonzero(rim >= MOVED)
+    moved = np.flatnonzero(rim >= MOVED_M)
     return int(moved[0]) if len(moved) else None
 
 
@@ -174,14 +174,14 @@ def swapped_order(
 ) -> tuple[int, ...] | None:
     """Return the measured column of each wheel, such as (3, -1, 2), or None if the order is right.
 
-    Columns are counted from 1; a negative number is a column that counts backwards. The result is
+    Columns are counted from 1; a negative number is a column with the opposite sign. The result is
     the order and signs in which the measured steps are closest to the reference:
 
         misfit = sum_i |m_order(i) sign_i - ref_i|^2 / sum_i |ref_i|^2
 
-    Only the sums of products of every pair of columns enter, so that trying all orders of six
-    wheels is fast. Steps may be any measure of wheel motion, such as the angle turned [rad], the
-    same in both arrays.
+    It is computed from the sums of products of every pair of columns, so that trying all orders of
+    six wheels is fast. Steps may be any measure of wheel motion, such as the angle turned [rad],
+    the same in both arrays.
     """
     products = measured.T @ reference
     norm, reference_norm = float(np.sum(measured**2)), float(np.sum(reference**2))
@@ -194,6 +194,6 @@ def swapped_order(
         (norm - 2.0 * float(total)) / reference_norm + 1.0
         for total in (np.trace(products), np.abs(along).sum())
     )
-    if declared <= DOUBT or found >= BETTER * declared:
+    if declared <= DOUBTFUL_MISFIT or found >= CLEARLY_BETTER_RATIO * declared:
         return None
     return tuple(-(k + 1) if value < 0 else k + 1 for k, value in zip(best, along, strict=True))

@@ -1,4 +1,4 @@
-"""Runs cut into segments of several windows each; the likelihood is a sum over segments."""
+"""Division of runs into segments of several windows each; the likelihood is a sum over segments."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -11,9 +11,9 @@ from slipid.support.errors import DataError
 
 NORMAL_STD = 0.6827
 """Probability that a normally distributed variable is within one std of its mean [1]."""
-UNREAD = 1e6
-"""Variance assigned to the mean of a window without any reading [A^2] or [V^2]; it is so large that
-the mean carries no information."""
+UNREAD_VARIANCE = 1e6
+"""Variance assigned to the mean of a window without any reading [A^2] or [V^2]; it is large enough
+that the mean has practically no weight."""
 PerWindow = Float[np.ndarray, "window wheel"]
 
 
@@ -25,7 +25,7 @@ class Windows:
         run: index of the run of each segment (segment,).
         surface, load, session: name of the surface, load set-up and session of each segment.
         start: time in its run at which each segment starts [s] (segment,).
-        dt: length of each window [s] (segment, window).
+        dt: duration of each window [s] (segment, window).
         turn: rotation of each wheel in the window [rad] (segment, window, wheel) if the camera lags
             by `lag`.
         speed_change: wheel speed at the window's end less that at its start [rad/s], so that
@@ -33,11 +33,12 @@ class Windows:
         pose: pose at the edges of the windows (segment, window + 1, 3), as logged.
         current: mean of the signed current or of its magnitude [A]; zeros if not logged.
         voltage: mean voltage [V]; zeros if not logged.
-        current_var: variance of the mean current due to the ammeter's noise [A^2]; `UNREAD` where
-            no current was read in the window.
-        voltage_var: variance of the mean voltage due to missing readings [V^2]; `UNREAD` where no
-            voltage was read in the window.
-        has_current, has_voltage: whether all runs have logged currents, or voltages.
+        current_var: variance of the mean current due to the ammeter's noise [A^2];
+            `UNREAD_VARIANCE` where no current was read in the window.
+        voltage_var: variance of the mean voltage due to missing readings [V^2]; `UNREAD_VARIANCE`
+            where no voltage was read in the window.
+        has_current: True if all runs have logged currents.
+        has_voltage: True if all runs have logged voltages.
         current_is_signed: False if `current` is a mean of magnitudes.
         lag: assumed lag of the camera behind the encoders [s].
     """
@@ -82,17 +83,17 @@ class Windows:
 def windows(
     data: Runs, wheel_radius: float, lag: float = 0.0, per_segment: int = 4, longest: float = 6.0
 ) -> Windows:
-    """Return every run cut into segments of `per_segment` windows, from its first motion on.
+    """Return the runs divided into segments of `per_segment` windows, from their first motion on.
 
     Args:
         data: the runs.
         wheel_radius: radius of the wheels [m]; it only determines where motion starts.
         lag: lag of the camera behind the encoders [s].
         per_segment: number of windows in each segment.
-        longest: largest length of a window [s]; longer runs have more segments.
+        longest: largest duration of a window [s]; longer runs have more segments.
 
     Raises:
-        DataError: a run has no wheel that moves `MOVED`, or has too few poses for its windows.
+        DataError: a run has no wheel that moves `MOVED_M`, or has too few poses for its windows.
     """
     each = [_edges(data, k, wheel_radius, lag, per_segment, longest) for k in range(len(data))]
     run = [k for k, segments in enumerate(each) for _ in segments]
@@ -161,8 +162,8 @@ def _edges(
 ) -> list[np.ndarray]:
     """Return, for each segment of a run, the rows at the edges of its windows.
 
-    These rows have a new pose, and the pose's true time, earlier by the lag, lies in the record of
-    the wheels.
+    These rows have a new pose, and the true time of this pose, which is earlier by the lag, lies in
+    the record of the wheels.
     """
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
@@ -170,8 +171,8 @@ def _edges(
     fresh = fresh[(fresh >= first) & (shown >= time[0] - 1e-9) & (shown <= time[-1] + 1e-9)]
     if len(fresh) < per_segment + 1:
         raise DataError(
-            f"{data.logs[run].name}: {len(fresh)} poses after the robot started; "
-            f"expected at least {per_segment + 1}"
+            f"{data.logs[run].name}: {len(fresh)} poses after the robot started to move; expected "
+            f"at least {per_segment + 1}"
         )
     t = data.time[data.rows(run)][fresh]
     segments = max(1, int(np.ceil((t[-1] - t[0]) / (per_segment * longest) - 1e-9)))
@@ -220,7 +221,7 @@ def _cut(
             return zero, zero
         read = None if fresh is None else fresh[rows]
         mean, count, missed = _mean(t, values, data.live[rows], read, at)
-        return mean, np.where(count > 0, noise / np.maximum(count, 1) + missed, UNREAD)
+        return mean, np.where(count > 0, noise / np.maximum(count, 1) + missed, UNREAD_VARIANCE)
 
     mean_current, current_var = meter(amps, data.current_fresh, noise)
     mean_voltage, voltage_var = meter(volts, data.voltage_fresh, 0.0)
@@ -246,18 +247,19 @@ def _mean(
 ) -> tuple[PerWindow, PerWindow, PerWindow]:
     """Return each window's time average, number of readings, and variance by missing readings.
 
-    A row stands for the time from halfway to the previous row to halfway to the next. (A plain mean
-    over the rows in a window would be biased, because its first row comes after the edge: while a
-    robot speeds up, voltages would come out too high.) Between the readings of a slow meter the
-    signal is taken as linear; had it jumped from one reading to the next at an unknown time in
-    between, the mean over that time would have an error with a std of their difference over
-    sqrt(12). Rows of telemetry stalls are left out, except in windows that have no other rows.
+    Each row is weighted by the time from the middle between it and the previous row to the middle
+    between it and the next row. (A plain mean over the rows in a window would be biased, because
+    its first row comes after the edge: while a robot speeds up, mean voltages would be too high.)
+    Between the readings of a slow meter the signal is taken as linear; if it really jumped from one
+    reading to the next at an unknown time in between, the mean over that time has an error with a
+    std of their difference over sqrt(12). Rows of telemetry stalls are left out, except in windows
+    that have no other rows.
 
     Args:
         time: times of the rows [s].
         x: current [A] or voltage [V] of each wheel's motor.
         live: False in the rows of a telemetry stall.
-        fresh: whether each value was read in its row; None if all were.
+        fresh: True for values that were read in their row; None if all were.
         at: times of the window edges on the clock of the rows [s].
     """
     bounds = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
@@ -285,7 +287,7 @@ def _mean(
 def _between(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], read: Bool[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
-    """Return a signal made linear between its readings, and the variance rate of a missed jump.
+    """Return a signal interpolated between its readings, and the variance rate of possible jumps.
 
     In the rows between two readings that differ by d and are a time T [s] apart, the rate is
     d^2 T / 12; it is 0 between readings in successive rows. Its integral over T is the variance of

@@ -1,4 +1,4 @@
-"""Texts of log files: with slipid's own columns, and with those of the published Robotino logs."""
+"""Texts of log files, with the columns of slipid or those of the published Robotino logs."""
 
 from collections.abc import Sequence
 from io import StringIO
@@ -16,12 +16,12 @@ OPTIONAL = {
     "bus_voltage": ("V", "%.2f"),
     "gyro": ("rad/s", "%.5f"),
 }
-"""Unit and number format of the channels that not every log has."""
+"""Unit and number format of the optional channels of a log."""
 _IMAGE = (1920, 1080)
 
 
 def own_columns(wheels: int, more: Sequence[str]) -> Content:
-    """Return the columns of the file that `own_csv` writes, as a config declares them.
+    """Return the `columns` table of a config for files written by `own_csv`.
 
     `more` has the names of the `OPTIONAL` channels in the file.
     """
@@ -45,9 +45,10 @@ def own_columns(wheels: int, more: Sequence[str]) -> Content:
 
 
 def own_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
-    """Return the text of a CSV file, in slipid's own columns, of a run.
+    """Return the text of a CSV file of a run, with the columns of slipid.
 
-    The run has commands, currents and poses; `ticks_per_revolution` are those of the motor.
+    The run must have commands, currents and poses; `ticks_per_revolution` is the number of encoder
+    ticks per turn of the motor.
     """
     assert log.twist_command is not None
     assert log.current is not None
@@ -97,7 +98,7 @@ def robotino2022_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> 
     assert log.current is not None
     assert log.pose is not None
     if log.wheels != 3:
-        raise ValueError(f"{log.name}: {log.wheels} wheels; the 2022 layout has three")
+        raise ValueError(f"{log.name}: {log.wheels} wheels; expected three for the 2022 layout")
     scale = preset("robotino2022").metres_per_pixel
     assert scale is not None
     x = 0.5 * _IMAGE[0] - log.pose[:, 0] / scale[0]

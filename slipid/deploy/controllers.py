@@ -1,4 +1,4 @@
-"""Combinations of estimator and controller by name: rows of a trial and choices of an export."""
+"""Named combinations of estimator and controller, for trials and exports."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -30,10 +30,10 @@ class ControllerRow:
         correction: torque correction of the 2021 paper.
         law: function that returns, for a robot, the published control law that replaces the pose
             loop; None for the pose loop.
-        tuned: whether it uses the tuned gains of robot.json where they are better than those set by
+        tuned: True if it uses the tuned gains of robot.json when they are better than those set by
             hand.
-        gyro: whether the robot has a gyro.
-        mapped: whether the estimator has the map of the site's floors.
+        gyro: True if the robot has a gyro.
+        mapped: True if the estimator has the map of the site's floors.
     """
 
     observer: str
@@ -53,20 +53,22 @@ class ControllerRow:
 
 
 CONTROLLERS: Mapping[str, ControllerRow] = {
-    "encoder": ControllerRow("encoder", "trusts its encoders"),
-    "slip_odometry": ControllerRow("curve", "odometry less slip over current (figure 5)"),
+    "encoder": ControllerRow("encoder", "odometry from encoders, without slip"),
+    "slip_odometry": ControllerRow("curve", "odometry corrected by slip over current (figure 5)"),
     "paper_print": ControllerRow("curve", "and torque correction as printed", "paper_print"),
     "paper_code": ControllerRow(
-        "curve", "and torque correction as its authors ran it", "paper_code"
+        "curve", "and torque correction as in the authors' program", "paper_code"
     ),
     "torque": ControllerRow("curve", "and torque correction, corrected", "torque"),
     "contact": ControllerRow(
-        "contact", "contact estimator, tuned gains where they are better", tuned=True
+        "contact", "contact estimator, with tuned gains if they are better", tuned=True
     ),
     "contact_map": ControllerRow(
-        "contact", "contact, with the map of its floors", tuned=True, mapped=True
+        "contact", "contact estimator with a map of the floors", tuned=True, mapped=True
     ),
-    "contact_gyro": ControllerRow("contact", "contact, with a gyro", tuned=True, gyro=True),
+    "contact_gyro": ControllerRow(
+        "contact", "contact estimator with a gyro", tuned=True, gyro=True
+    ),
 }
 
 
@@ -94,6 +96,6 @@ def control_loop_of(
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
-        gains = replace(gains, preview=jnp.asarray(0.0))  # the paper's loop has no preview
+        gains = replace(gains, preview=jnp.asarray(0.0))  # The loop of the paper has no preview.
     law = None if row.law is None else row.law(robot)
     return ControlLoop(estimator, Controller(robot, gains, correction=row.correction, law=law))

@@ -30,9 +30,9 @@ from slipid.support.errors import DataError
 
 ROBOT = "robot.json"
 NO_CONTROLLER = (
-    "the wheels of this robot cannot be asked for any motion ahead, sideways and in yaw, each "
-    "wheel alone: it has an estimator (slipid.Estimator), but no controller, so nothing to drive "
-    "in a trial or to export; identify, validate, compare, sample, selftest and design apply"
+    "the drives of this robot cannot produce every motion ahead, sideways and in yaw: it has an "
+    "estimator (slipid.Estimator), but no controller, so trial and export are not available; "
+    "identify, validate, compare, sample, selftest and design are"
 )
 """Message for wheels that have no controller."""
 DRAWS = 64
@@ -42,8 +42,8 @@ DRAWS = 64
 def deploy(found: Fit | Posterior) -> DeployedRobot:
     """Return the robot of a fit or of its posterior, with its first load set-up.
 
-    Its numbers are those of `identified.json`. They come from the posterior if there is one, else
-    from the fit's Laplace approximation; `DeployedRobot.record.source` names the method.
+    Its parameters are those of `identified.json`. They come from the posterior if there is one,
+    else from the fit's Laplace approximation; `DeployedRobot.record.source` names the method.
     """
     source: Source
     if isinstance(found, Posterior):
@@ -64,7 +64,7 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
         fit.current_trend,
         fit.validity,
     )
-    # a fit that used runs over several floors expects to drive on several
+    # If the fit used runs over several floors, the robot is expected to drive on several.
     alike = record.alike if fit.mixed is None else MIXED_FLOORS_PENALTY
     return DeployedRobot.of(
         replace(
@@ -116,7 +116,7 @@ def _record(
 ) -> RobotRecord:
     """Return the record of a robot.
 
-    `center` is the search vector of its numbers, and `vectors` are posterior draws of it.
+    `center` is the search vector of its parameters, and `vectors` are posterior draws of it.
     """
     return robot_record(
         robot,
@@ -133,7 +133,7 @@ def _record(
 def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
     """Write robot.json into the folder of a fit; return the names of the files written."""
     robot, path = deploy(found), out / ROBOT
-    with suppress(DataError):  # keep tuned gains if the robot's numbers have not changed
+    with suppress(DataError):  # keep tuned gains if the robot's parameters are unchanged
         before = DeployedRobot.load(path).record if path.is_file() else robot.record
         if before.numbers == robot.record.numbers:
             robot = DeployedRobot.of(replace(robot.record, gains=before.gains))
@@ -142,9 +142,10 @@ def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
 
 
 def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()) -> DeployedRobot:
-    """Return the robot in a file, or in a folder that `slipid identify` wrote.
+    """Return the robot in a file, or in a result folder of `slipid identify`.
 
-    Its wheels must be able to drive with a controller. `floors` are those it has, by default all.
+    The robot must be able to use a controller. `floors` are the names of its floors, by default
+    all.
 
     Raises:
         DataError: there is no robot, its wheels have no controller, it has no such load set-up or
@@ -153,7 +154,7 @@ def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()
     path = source if source.suffix == ".json" else source / ROBOT
     if not path.is_file():
         raise DataError(
-            f"{path}: not there; `slipid identify` writes it, so run it with --out {path.parent}"
+            f"{path}: missing; it is written by `slipid identify` with --out {path.parent}"
         )
     robot = DeployedRobot.load(path, load)
     if not robot.steers:
@@ -171,7 +172,7 @@ def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
 
 
 def _number(e: Estimate) -> RecordedNumber:
-    """Return an estimate in the form that robot.json stores."""
+    """Return an estimate in the form of robot.json."""
     values = {f.name: getattr(e, f.name) for f in fields(RecordedNumber)}
     return typed(RecordedNumber, json.loads(json.dumps(values)), e.path)
 

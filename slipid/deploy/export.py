@@ -65,9 +65,9 @@ class Exported:
     Attributes:
         folder: path of the folder.
         files: names of its files.
-        robot: hash of the robot's numbers.
+        robot: hash of the robot's parameters.
         forms: forms that it contains.
-        warnings: warnings about numbers that are not identified, at a bound or disputed.
+        warnings: warnings about parameters that are not identified, at a bound or disputed.
     """
 
     folder: Path
@@ -87,8 +87,8 @@ def export(
     """Write a robot, with one of the controllers `rows`, in all requested forms to a folder.
 
     Raises:
-        DataError: there is no such form, controller or path, a step cannot be turned into C, or the
-            folder cannot be written or contains other files.
+        DataError: there is no such form, controller or path, a step cannot be converted to C, or
+            the folder cannot be written or contains other files.
     """
     row = _checked_row(options, rows)
     check_writable(out)
@@ -138,7 +138,7 @@ def _checked_row(options: ExportOptions, rows: Mapping[str, ControllerRow]) -> C
         raise DataError(f"no controller '{controller}'{close}; expected one of {choices}")
     row = rows[controller]
     if row.mapped and options.map is None:
-        raise DataError(f"controller {controller} needs the map of its floors; name one with --map")
+        raise DataError(f"controller {controller} needs a map of the floors; give one with --map")
     if options.map is not None and not row.mapped:
         raise DataError(
             f"controller {controller} uses no map; omit --map, or use --controller contact_map"
@@ -153,7 +153,7 @@ def record_example(
     start: tuple[float, float, float],
     name: str,
 ) -> Recording:
-    """Return a closed-loop run on the twin, with the readings, which the twin then gives again.
+    """Return a closed-loop run on the twin, with the readings of its sensors.
 
     Args:
         loop: estimator and controller.

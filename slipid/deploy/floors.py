@@ -1,4 +1,4 @@
-"""Floor maps as arrays that estimators and users can look up in jitted functions."""
+"""Floor maps as arrays for use in jitted functions."""
 
 from pathlib import Path
 
@@ -23,8 +23,9 @@ def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
 def floor_map(path: Path | str, robot: DeployedRobot) -> Floor:
     """Return the floor map in a TOML file, in the form that a robot's `Estimator` uses.
 
-    For a robot that has only jax installed, write it with `Floor.save` and read it there with
-    `Floor.load`. Cells with surfaces that the robot does not know give it no information.
+    For a robot on which only jax is installed, write the map with `Floor.save` and read it there
+    with `Floor.load`. Cells with surfaces that were not identified give the estimator no
+    information.
 
     Raises:
         DataError: the file is not a map, or contains none of the robot's surfaces.
@@ -42,11 +43,11 @@ class WheelFloors(eqx.Module):
     """Floor under each wheel.
 
     Attributes:
-        surface: number of the surface in the map's list of surfaces.
+        surface: index of the surface in the map's list of surfaces.
         border: distance from the middle of the wheel to the nearest other surface [m], to within
             half a cell of the map; infinite on a map of a single surface.
-        inside: whether the wheel is on the map; beyond its edge, surface and border are those of
-            the nearest cell.
+        inside: True if the wheel is on the map; outside it, surface and border are those of the
+            nearest cell.
     """
 
     surface: Int[Array, "*batch wheel"]
@@ -79,7 +80,7 @@ class FloorLookup(eqx.Module):
 
     @classmethod
     def read(cls, path: Path | str) -> "FloorLookup":
-        """Return the lookup of a map file; raise `DataError` where it is not a map."""
+        """Return the lookup of a map file; raise `DataError` if it is not a map."""
         return cls.of(read_map(Path(path)))
 
     @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""Record of a robot: its numbers, and quantities computed once from the model.
+"""Record of a robot: its parameters, and quantities computed once from the model.
 
 The effect table of robot.json follows from the effects that fitted runs share. As in forecasts
 (`slipid.fitting.shared_effects`), the motion along, across and in yaw, per metre that the wheels
@@ -48,15 +48,15 @@ def robot_record(
     seen: Mapping[str, Validity],
     effects: Mapping[str, EffectRecord] = MappingProxyType({}),
 ) -> record.RobotRecord:
-    """Return the record of a robot, whose fields on the origin of the numbers have defaults.
+    """Return the record of a robot; its fields about the source of the numbers have defaults.
 
     Args:
         robot: robot with every number at its value in `numbers`.
         numbers: parameters keyed by path; those of the camera are not recorded.
         std: std of every variance component by name (such as `process.gray.along`), as used in
             forecasts of new runs.
-        draws: posterior draws of the robot, stacked, which show how uncertain numbers affect the
-            motion.
+        draws: posterior draws of the robot, stacked, from which the uncertainty of the motion is
+            computed.
         highest_speed: highest wheel speed of the fitted runs [rad/s].
         current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v
             [A, A s/m].
@@ -79,7 +79,7 @@ def robot_record(
 
 
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
-    """Yield path and draws of every number that varies over draws, except those of the camera."""
+    """Yield path and draws of every parameter that varies over draws, except the camera's."""
     for e in entries(robot):
         leaf = np.asarray(e.whole(draws))
         rows = leaf if e.index is None else leaf[:, e.index]
@@ -234,7 +234,7 @@ _Grid = Float[np.ndarray, "floor speed direction 3"]
 def effects_by_load(
     contact: ForceBalance, center: Float[np.ndarray, " free"], draws: Float[np.ndarray, "draw free"]
 ) -> dict[str, EffectRecord]:
-    """Return the effect table of every load set-up; empty where no runs share effects.
+    """Return the effect table of every load set-up; empty if no runs share effects.
 
     Args:
         contact: fitted force balance.
@@ -261,7 +261,7 @@ def _effect_table(
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
     k = contact.robot.load_index(load)
     moved = [moved_per_metre(robots, k, np.exp(s), directions(DIRECTIONS)) for s in log_speed]
-    predicted = np.concatenate(moved, axis=2)  # directions, by speed
+    predicted = np.concatenate(moved, axis=2)  # directions for each speed
     shape = (len(labels), count, DIRECTIONS, len(AXES))
     mean, left = np.zeros(shape), np.zeros(shape)
     for n, floor in enumerate(labels):

@@ -20,8 +20,8 @@ REST_S = 1.0
 def twin_floor(robot: DeployedRobot) -> FloorMap:
     """Return a map of patches about as large as the robot, half of them with the least slip.
 
-    With the test site's firm, medium and soft floors, a robot that trusts its encoders then travels
-    80 to 90 % of the first side, as on the paper's site.
+    With the firm, medium and soft floors of the test site, a robot controlled by encoder odometry
+    then travels 80 to 90 % of the first side, as on the site of the paper.
     """
     labels = robot.labels
     slip = [float(np.mean(f.seen.slip)) if f.seen is not None else 0.0 for f in robot.record.floors]
@@ -33,10 +33,10 @@ def twin_floor(robot: DeployedRobot) -> FloorMap:
 
 
 def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, float]]:
-    """Return start poses [m, m, rad] all over a site, the same at every call.
+    """Return start poses [m, m, rad] spread over a site, the same at every call.
 
     Headings are evenly spread. The middle of the path, which begins at the start pose, stays 0.8 m
-    away from the site's edge where there is room.
+    away from the edge of the site if there is room.
     """
     rng = np.random.default_rng(STARTS_SEED)
     x0, y0, x1, y1 = floor.extent
@@ -54,14 +54,14 @@ def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, 
 
 
 def require_known_surfaces(floor: FloorMap, robot: DeployedRobot, path: str) -> None:
-    """Raise `DataError` if a map, read from `path`, has a surface that the robot does not know."""
+    """Raise `DataError` if a map, read from `path`, has a surface that was not identified."""
     if absent := [name for name in floor.surfaces if name not in robot.labels]:
         known = ", ".join(robot.labels)
         raise DataError(f"{path}: no surface '{absent[0]}'; identified: {known}")
 
 
 def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
-    """Return the path with this name from the origin, at a speed [m/s].
+    """Return the path with this name, which begins at the origin, at a speed [m/s].
 
     Raises:
         DataError: there is no such path, or the speed exceeds the highest rim speed of the fitted

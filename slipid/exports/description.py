@@ -1,4 +1,4 @@
-"""Texts that exported files share: numbers of a robot, their origin, warnings and the README."""
+"""Texts common to exported files: numbers of a robot, their source, warnings and the README."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,24 +13,25 @@ from slipid.robot.record import Pair, Provenance, Source, Verdict
 from slipid.robot.robot_file import declared_numbers
 
 VERDICTS: Mapping[Verdict, str] = {
-    "identified": "the logs decide it; use it",
-    "weak": "the logs narrow it, yet what was assumed before still counts: mind its interval",
-    "disputed": "floors disagree about it: use it where it was seen, and not beyond",
-    "not_identified": "the logs say next to nothing of it: the value is what was assumed before, "
-    "no measurement. Do not build on it without measuring it otherwise",
-    "at_bound": "the logs push it to an end of what is possible: the value is that end. The model, "
-    "or a number that was held fixed, may be wrong",
-    "fixed": "it was given and not fitted: as good as who gave it",
+    "identified": "determined by the logs",
+    "weak": "the logs reduce its uncertainty, but its prior still counts: note its interval",
+    "disputed": "its estimates on different floors disagree: do not use it under other conditions "
+    "than those of the logs",
+    "not_identified": "the logs do not determine it: its value is an assumption (the prior), not a "
+    "measurement. Do not rely on it without measuring it in another way",
+    "at_bound": "the fit ended at a bound of its possible values. The model, or a number that was "
+    "held fixed, may be wrong",
+    "fixed": "it was given by the user and not fitted",
 }
 PROVENANCES: Mapping[Provenance, str] = {
-    "measured": "the logs decide",
-    "borrowed": "what was assumed before decides: a default, a data sheet, a prior",
-    "override": "it was held at a chosen value",
+    "measured": "the logs",
+    "borrowed": "a prior: a default or a data sheet",
+    "override": "a value chosen by the user",
 }
 WARNINGS: Mapping[Verdict, str] = {
-    "not_identified": "NOT IDENTIFIED, their values are assumed and no measurement",
-    "at_bound": "AT A BOUND, the model or a number that was held fixed may be wrong",
-    "disputed": "DISPUTED, floors disagree about them",
+    "not_identified": "NOT IDENTIFIED (their values are assumptions, not measurements)",
+    "at_bound": "AT A BOUND (the model, or a number that was held fixed, may be wrong)",
+    "disputed": "DISPUTED (their estimates on different floors disagree)",
 }
 """Warning for each verdict about which a user must be warned."""
 
@@ -40,15 +41,15 @@ class NumberRow:
     """One number of a robot, as a row of a table.
 
     Attributes:
-        group: key of the table that it belongs to.
+        group: key of the table to which it belongs.
         name: name of the number; its path if it is in robot.json.
-        entry: wheel that it belongs to, such as "wheel 2"; empty for a number of the whole robot.
+        entry: wheel to which it belongs, such as "wheel 2"; empty for a number of the whole robot.
         symbol: symbol in equations.
         value: value [unit].
         unit: unit of the value.
-        interval90: 90 % interval [unit]; None where there is none.
+        interval90: 90 % interval [unit]; None if there is none.
         verdict: verdict on its identification, as text for people.
-        provenance: what determines its value, as text for people.
+        provenance: source of its value, as text for people.
         about: meaning in words.
     """
 
@@ -92,39 +93,45 @@ LIMITS: Mapping[str, tuple[str, str]] = {
     "wheel_speed": ("rad/s", "largest speed of a wheel"),
     "acceleration": ("rad/s^2", "largest change of a wheel's speed"),
     "voltage": ("V", "of the supply"),
-    "twist": ("m/s", "largest speed asked of the body"),
+    "twist": ("m/s", "largest speed demanded of the body"),
 }
 """Unit and meaning of every field of `slipid.robot.controller.Limits`."""
 
 
 def gains_origin(robot: DeployedRobot) -> str:
     """Return sentences about the origin of a robot's gains and limits, which are not identified."""
-    limits = "Limits are the defaults of slipid: put in those of your motors and supply."
+    limits = (
+        "The limits are defaults of slipid and not identified: enter those of your motors and "
+        "supply."
+    )
     tuned = robot.record.gains
     if tuned is None:
         return f"Gains set by hand. {limits}"
     if tuned.load != robot.load_setup:
         load = one_line(tuned.load)
-        return f"Gains set by hand; those tuned are for the load set-up {load}. {limits}"
+        return f"Gains set by hand; the tuned gains are for the load set-up {load}. {limits}"
     if not tuned.is_better:
-        return f"Gains set by hand; those tuned are {tuned.verdict}. {limits}"
+        return f"Gains set by hand; the tuned gains are {tuned.verdict}. {limits}"
     loss = f"loss {tuned.loss.tuned:.1f} mm, by hand {tuned.loss.hand:.1f} mm"
     gyro = "with a gyro" if tuned.gyro else "without a gyro"
-    return f"Gains tuned on the twin {gyro}: better than by hand in rehearsals ({loss}). {limits}"
+    return (
+        f"Gains tuned on the twin {gyro}, better than those set by hand in simulated runs "
+        f"({loss}). {limits}"
+    )
 
 
 SOURCES: Mapping[Source, str] = {
     "laplace": "a fit to logs (Laplace approximation)",
     "posterior": "the posterior of a fit to logs",
-    "given": "given values, no logs",
+    "given": "values given without logs",
 }
 
 
 def header(robot: DeployedRobot) -> list[str]:
-    """Return comment lines, without comment signs, about the origin of an exported file.
+    """Return comment lines, without comment signs, about the source of an exported file.
 
-    They name origin, floors, loads, verdicts and warnings. Each line is plain printable text of at
-    most 96 characters, unless a single word is longer.
+    They give the source, floors, loads, verdicts and warnings. Each line is plain printable text of
+    at most 96 characters, unless a single word is longer.
     """
     sentences = (*_sentences(robot), *(f"WARNING: {text}" for text in warnings(robot)))
     return [line for sentence in sentences for line in wrapped(sentence)]
@@ -141,7 +148,7 @@ def warned(robot: DeployedRobot) -> list[str]:
 
 
 def facts(robot: DeployedRobot) -> list[str]:
-    """Return origin, floors, loads, verdicts and messages of the fit as a list in Markdown."""
+    """Return source, floors, loads, verdicts and messages of the fit as a list in Markdown."""
     notes = (f"Note of the fit: {message}" for message in robot.record.messages)
     return [*(f"- {one_line(part)}" for part in (*_sentences(robot), *notes)), ""]
 
@@ -157,13 +164,13 @@ def warnings(robot: DeployedRobot) -> tuple[str, ...]:
 
 
 def _sentences(robot: DeployedRobot) -> Iterator[str]:
-    """Yield sentences about origin, floors, loads and verdicts."""
+    """Yield sentences about source, floors, loads and verdicts."""
     record = robot.record
-    yield f"Made by slipid {made_with()} from robot.json; make it anew rather than change it."
+    yield f"Made by slipid {made_with()} from robot.json; export it again instead of editing it."
     yield f"Numbers: {record.numbers} (`numbers` of robot.json)."
-    yield f"They come from {SOURCES[record.source]}."
+    yield f"Source of the numbers: {SOURCES[record.source]}."
     loads = listed([load.name for load in record.loads])
-    yield f"Load set-up: {one_line(robot.load_setup)}, of those known: {loads}."
+    yield f"Load set-up: {one_line(robot.load_setup)}; identified load set-ups: {loads}."
     yield f"Floors: {listed(robot.labels)}."
     counts = Counter(record.parameters[e.path].verdict for e in declared_numbers(record))
     listing = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
@@ -179,13 +186,13 @@ def made_with() -> str:
 
 
 ABOUT: Mapping[str, str] = {
-    "c": "estimator and controller in C99, with a test of themselves and an example; also a "
-    "library for PlatformIO and the Arduino IDE",
-    "ros2": "parameters for drive controllers of ros2_controllers, for robot_localization, and of "
-    "a node of your own with their declaration",
+    "c": "estimator and controller in C99, with a test and an example; also a library for "
+    "PlatformIO and the Arduino IDE",
+    "ros2": "parameters for drive controllers of ros2_controllers, for robot_localization, and for "
+    "your own node (with their declaration)",
     "stablehlo": "the same step for programs in JAX: `jax.export.deserialize`, or "
     "`slipid.exports.stablehlo.load_program`, which compares it first",
-    "table": "gains, limits and matrices for a person who types them in",
+    "table": "gains, limits and matrices as tables, for entering them by hand",
 }
 
 

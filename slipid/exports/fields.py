@@ -101,7 +101,8 @@ def fields_of(
         tree: arrays, in modules that may contain further modules.
         documented: class whose docstring describes the attributes; by default that of the tree.
         prefix: beginning of the fields' names.
-        above: description of the attribute that holds the tree, used where there is no other.
+        above: description of the attribute that contains the tree, used for leaves without a
+            description.
     """
     if is_dataclass(tree) and not isinstance(tree, type):
         docs = attribute_docs(documented or type(tree))

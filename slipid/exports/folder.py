@@ -1,7 +1,7 @@
 """A folder for a robot: robot.json, its exported forms, and a checksum of every file.
 
 `sha256sum -c SHA256SUMS` checks the folder without slipid. Folders named `build` are ignored: they
-hold files that users build from the exported ones.
+contain files that users build from the exported ones.
 """
 
 from __future__ import annotations
@@ -49,19 +49,20 @@ def check_writable(folder: Path) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise DataError(f"{folder}: not a folder; name another one with --out")
+        raise DataError(f"{folder}: not a folder; expected another path (--out)")
     sums = _sums(folder) if (folder / SUMS).is_file() else {}
     for name in sorted(_files(folder) - {SUMS}):
         if _name_of_temporary(name) in {SUMS, *sums}:
             continue  # a temporary file of an interrupted export may be overwritten
         if name not in sums:
             raise DataError(
-                f"{folder}: has files that no export wrote ({name}); name another folder with --out"
+                f"{folder}: contains files that are not from an export ({name}); expected another "
+                "folder (--out)"
             )
         if _sum((folder / name).read_bytes()) != sums[name]:
             raise DataError(
-                f"{folder / name}: changed after it was written, and would be lost; move it "
-                "elsewhere, or name another folder with --out"
+                f"{folder / name}: changed since it was written, and would be overwritten; move "
+                "it elsewhere, or choose another folder (--out)"
             )
 
 
@@ -80,8 +81,8 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
             raise DataError(f"{place / name}: {error.strerror}; export the robot again") from error
         if _sum(data) != expected:
             raise DataError(
-                f"{place / name}: changed or damaged after it was written; export the robot again, "
-                "to another folder"
+                f"{place / name}: changed or damaged since it was written; export the robot "
+                "again, to another folder"
             )
     if more := sorted(_files(place) - set(sums) - {SUMS}):
         raise DataError(
@@ -101,7 +102,7 @@ def _sums(folder: Path) -> dict[str, str]:
     named = {line[2]: line[1] for line in lines if line and ".." not in line[2].split("/")}
     if not lines or len(named) < len(lines):
         raise DataError(
-            f"{folder / SUMS}: cannot be read; expected a folder that `slipid export` wrote"
+            f"{folder / SUMS}: cannot be read; expected a folder written by `slipid export`"
         )
     return named
 

@@ -1,4 +1,4 @@
-"""Reference steps, inputs with the library's outputs, that an exported program must reproduce."""
+"""Reference steps (inputs and outputs of the library) that an exported program must reproduce."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A control loop's step as StableHLO, for programs that run XLA without slipid.
+"""The step of a control loop as StableHLO, for programs that run XLA without slipid.
 
 `step.json` lists the input and output arrays in their order, with names, shapes and units.
 """
@@ -32,7 +32,7 @@ TOLERANCE = 1e-9
 """Largest difference between a number that the loaded program computes and the library's result,
 relative to the number's scale [1]."""
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""Platforms that the programs run on."""
+"""Platforms on which the programs run."""
 FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
 
 
@@ -135,8 +135,8 @@ def load_program(folder: Path | str) -> Program:
         schema = about.pop("schema")
         if schema != SCHEMA:
             raise DataError(
-                f"{place / 'step.json'}: written as {schema}, this slipid reads {SCHEMA}; update "
-                "slipid, or export the robot again"
+                f"{place / 'step.json'}: its schema is {schema}, but this version of slipid reads "
+                f"{SCHEMA}; update slipid, or export the robot again"
             )
         signature = typed(Signature, about)
         arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
@@ -145,7 +145,7 @@ def load_program(folder: Path | str) -> Program:
         steps = Golden(arrays["given"], arrays["said"], arrays["command"])
     except DataError:
         raise
-    except Exception as error:  # the parsers of three formats raise many kinds of errors
+    except Exception as error:  # The parsers of three formats raise many kinds of errors.
         raise DataError(f"{place}: damaged ({error}); export the robot again") from error
     program = Program(signature, tuple(start), *programs)
     _check_results(program, steps, place)

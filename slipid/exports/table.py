@@ -1,4 +1,4 @@
-"""The numbers of a robot as plain tables, for a person who types them into a controller.
+"""The numbers of a robot as plain tables, for entering them into a controller by hand.
 
 `gains.md` is for reading and shows each value rounded and with all digits. `gains.csv` has the same
 rows with all digits; its lines that start with # are comments.
@@ -31,9 +31,9 @@ _TITLES = {
     "gains": "Controller gains",
     "limits": "Limits",
     "forward": "Kinematics J: rim speed of a wheel [m/s] from the body twist",
-    "inverse": "Its pseudo-inverse: body twist from rim speeds [m/s]",
-    "motor": "Motor, all wheels alike",
-    "wheel_curve": "Slip ratio of a wheel, a + b |I|, all floors together",
+    "inverse": "Pseudo-inverse of J: body twist from rim speeds [m/s]",
+    "motor": "Motor, the same for all wheels",
+    "wheel_curve": "Slip ratio a + b |I| of each wheel, over all floors",
     "robot": "Wheels and body",
     "surface": "Floors",
 }
@@ -65,7 +65,7 @@ def _lines(robot: DeployedRobot) -> Iterator[NumberRow]:
 def _gains(robot: DeployedRobot) -> Iterator[NumberRow]:
     gains, tuned = Gains.of(robot), robot.record.gains
     taken = tuned is not None and tuned.is_better and tuned.load == robot.load_setup
-    sure = ("tuned, better than by hand", "robot.json") if taken else ("by hand", "default")
+    sure = ("tuned, better than set by hand", "robot.json") if taken else ("by hand", "default")
     for e in entries(gains):
         d = e.declaration
         spread = getattr(tuned.values, e.path).spread if tuned is not None and taken else None

@@ -1,7 +1,7 @@
 """Text for people: words on one line, rounded numbers, Markdown tables, templates of files.
 
-It also makes names for floors and load set-ups that are valid as ROS parameters, in C++ and in file
-names.
+The module also converts names of floors and load set-ups to names that are valid for ROS
+parameters, C++ and files.
 """
 
 import re
@@ -42,7 +42,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def template(name: str) -> str:
-    """Return the text of a file in this room's templates, such as `c99/README.md`."""
+    """Return the text of a template of `slipid/exports/templates`, such as `c99/README.md`."""
     return (files(__package__) / "templates" / name).read_text()
 
 
@@ -68,7 +68,7 @@ for friend goto if inline int long mutable namespace new not operator or private
 register requires return short signed sizeof static struct switch template this throw true try
 typedef typeid typename union unsigned using virtual void volatile while xor
 """
-_TAKEN = frozenset(_WORDS.split())
+_KEYWORDS = frozenset(_WORDS.split())
 """Keywords of C++, which fields of a generated struct cannot have as names."""
 
 
@@ -82,14 +82,16 @@ def identifiers(labels: Sequence[str], kind: str) -> tuple[str, ...]:
     for label in labels:
         plain = re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
         name = (
-            plain if plain[:1].isalpha() and plain not in _TAKEN else f"{kind}_{plain}".strip("_")
+            plain
+            if plain[:1].isalpha() and plain not in _KEYWORDS
+            else f"{kind}_{plain}".strip("_")
         )
         count, first = 2, name
-        while _bare(name) in map(_bare, names):
+        while _without_underscores(name) in map(_without_underscores, names):
             name, count = f"{first}_v{count}", count + 1
         names.append(name)
     return tuple(names)
 
 
-def _bare(name: str) -> str:
+def _without_underscores(name: str) -> str:
     return name.replace("_", "")

@@ -37,8 +37,7 @@ _SECTORS = 6
 LEAST_RUNS = 30
 """Smallest number of runs from which the 90 % coverage of end points is estimated.
 
-With fewer runs, less than three are expected outside the 90 % region.
-"""
+With fewer runs, less than three are expected outside the 90 % region."""
 _MOST_GROWTH = 10.0
 """Largest factor by which `extrapolation` multiplies variances."""
 _GRID = np.geomspace(0.1, 4.0, 60)
@@ -105,12 +104,11 @@ def extrapolation(
     Every sector of directions is predicted from the others, with the numbers of the floor estimated
     anew (to first order). The variances of shared effects and of the numbers are multiplied by the
     factor that puts 90 % of the end points into their 90 % regions; the variances of the run's own
-    effects and of the noise, which neighbours do not predict, are kept. The factor is 1 where at
-    least 90 % of the end points already lie in their regions, and where there are fewer than three
-    sectors or fewer than `LEAST_RUNS` runs. The factor is needed for two reasons: maximum
-    likelihood fits the variances to distances between neighbouring runs, so that they are too small
-    where the model is wrong on a larger scale; and it down-weights outliers, which occur in
-    forecast runs as well.
+    effects and of the noise, which neighbours do not predict, are kept. The factor is 1 if at least
+    90 % of the end points already lie in their regions, or if there are fewer than three sectors or
+    fewer than `LEAST_RUNS` runs. The factor is needed for two reasons: maximum likelihood fits the
+    variances to distances between neighbouring runs, so that they are too small if the model is
+    wrong on a larger scale; and it down-weights outliers, which occur in forecast runs as well.
 
     Args:
         axes: results of `axis_effects`.
@@ -134,7 +132,8 @@ class _HeldOutEffects(NamedTuple):
     Attributes:
         gap: effect less its prediction, on each axis.
         spread: variance of `gap`.
-        own: part of `spread` from the run's own effect and noise, which other runs do not predict.
+        own: part of `spread` due to the individual effect and noise of the run, which other runs
+            cannot predict.
     """
 
     gap: Float[np.ndarray, "segment 3"]
@@ -169,14 +168,16 @@ def _variance_growth(
 ) -> float:
     """Return the factor of one set-up's variances at which 90 % of end points are in 90 % regions.
 
-    `mine` marks the segments of the set-up. The run's own effects and noise are not multiplied.
+    `mine` marks the segments of the set-up. The variances of the individual effects and noise of
+    each run are not multiplied.
     """
     mine = mine & np.isfinite(held_out.gap).all(axis=1)
     if mine.sum() < LEAST_RUNS:
         return 1.0
     d = distance[mine]
     gap, spread, own = (x[mine] for x in held_out)
-    # yaw grows linearly along the run: the end point moves across by half the yaw times distance
+    # Yaw grows linearly along the run, so the end point moves sideways by half the yaw times
+    # distance.
     along, across = gap[:, 0], gap[:, 1] + 0.5 * d * gap[:, 2]
 
     def excess(log_growth: float) -> float:

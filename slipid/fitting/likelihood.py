@@ -24,13 +24,12 @@ MotorForce = Float[Array, "segment window drive 2"]
 PerChannel = Float[Array, "segment m"]
 """One value per window and drive, in one row per segment: window by window, then drive by drive."""
 Std = Float[Array, ""] | float
-SMOOTH = 0.03
-"""Current magnitude below which the prediction of an unsigned current levels off [A]."""
-FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
-"""Variance added to every residual of a kind for the rounding of the logs.
+SMOOTHING_A = 0.03
+"""Current magnitude below which the prediction of an unsigned current is smoothed [A]."""
+ROUNDING_VARIANCE = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
+"""Variance added to every residual for the rounding of the logs, by the kind of residual.
 
-`motion` [m^2] or [rad^2], `current` [A^2], `voltage` [V^2].
-"""
+`motion` [m^2] or [rad^2], `current` [A^2], `voltage` [V^2]."""
 
 _AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "current_var", "lag")
 
@@ -94,7 +93,7 @@ class ElectricNoise(eqx.Module):
             without the ammeter's noise.
         resistance: winding resistance R [ohm], which converts the uncertainty of the true current
             to a voltage. It is fixed during every round of a fit, as the variances are: these are
-            fitted to the size of the residuals, so that the size has no information left about R.
+            fitted to the size of the residuals, which therefore has no further information about R.
     """
 
     voltage_std: Std
@@ -108,7 +107,7 @@ class Predicted(eqx.Module):
     Attributes:
         increment: increments of the marker (x, y [m], yaw [rad]).
         twist: body twists (vx, vy [m/s], yaw rate [rad/s]).
-        motor_force: forces each motor works against [mu m g].
+        motor_force: contact forces against which each motor works [mu m g].
     """
 
     increment: Marker
@@ -153,8 +152,8 @@ def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | No
     """Return the results of function `of` for every window, with axes (segment, window, ...).
 
     `of` takes the wheel speeds of a window [rad/s], its element of `near` or None, and the indices
-    of its surface and load. It is mapped over one flat axis of all windows: tracing two nested axes
-    takes JAX half as long again.
+    of its surface and load. It is mapped over one flat axis of all windows: with two nested axes,
+    JAX would need 50 % more time for tracing.
     """
     segments, windows = b.dt.shape
 
@@ -187,7 +186,9 @@ def marker_increments(
 @eqx.filter_jit
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
     """Return the predicted motor current of every window [A]; its magnitude for unsigned logs."""
-    friction = robot.surfaces.friction[b.surface]  # forces are relative to its mean over wheels
+    friction = robot.surfaces.friction[
+        b.surface
+    ]  # Forces are divided by mu m g averaged over the wheels.
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * GRAVITY
     torque = (
@@ -196,7 +197,7 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
     amps = robot.motor.current(torque, wheel_speed(robot, b))
     if b.signed:
         return amps + robot.motor.current_offset
-    return jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
+    return jnp.sqrt(amps**2 + SMOOTHING_A**2) + robot.motor.current_offset
 
 
 @eqx.filter_jit
@@ -301,6 +302,6 @@ def voltage_spread(b: Batch, noise: ElectricNoise) -> PerChannel:
 def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
     """Return the std of the voltage noise [V], rounding included, from the log of its variance.
 
-    The rounding `FLOOR` keeps it above zero, since `voltage_spread` divides by it.
+    The rounding `ROUNDING_VARIANCE` keeps it above zero, since `voltage_spread` divides by it.
     """
-    return jnp.sqrt(jnp.exp(log_variance) + FLOOR["voltage"])
+    return jnp.sqrt(jnp.exp(log_variance) + ROUNDING_VARIANCE["voltage"])

@@ -1,12 +1,12 @@
-"""Runs over several floors: short windows in a row, with the floor under each wheel in each window.
+"""Runs over several floors as short windows, with the floor under each wheel in each window.
 
-The friction coefficient of a floor has no influence on motion where all wheels stand on that floor,
-because all forces of the balance are in proportion to it.
-Where wheels stand on different floors, the ratio of their frictions turns the robot. A run is one
-segment of many short windows, so that its camera noise, its process noise and the constant errors
-of its motion and its currents are in the covariance of the segment, as they are for runs on one
-floor. Windows do not count in the likelihood, and their residuals are set to zero, where a wheel
-changes floors, where wheel speeds are not steady, or beyond the end of a run.
+If all wheels stand on one floor, its friction coefficient has no influence on the motion, because
+all forces of the balance are proportional to it. If wheels stand on different floors, the ratio of
+the friction coefficients turns the robot. A run is one segment of many short windows, so that its
+camera noise, its process noise and the constant errors of its motion and its currents are in the
+covariance of the segment, as they are for runs on one floor. Windows in which a wheel changes
+floors or wheel speeds are not steady, and windows beyond the end of a run, are not used in the
+likelihood; their residuals are set to zero.
 """
 
 from collections.abc import Sequence
@@ -30,9 +30,9 @@ from slipid.support.errors import DataError
 SHORTEST, LONGEST = 0.25, 0.5
 """Shortest and longest window [s], short compared with the time a wheel stays on one floor."""
 LEAST_SPEED = 0.04
-"""Rim speed that the fastest wheel must reach for a window to count [m/s]."""
+"""A window is used only if the fastest wheel reaches this rim speed [m/s]."""
 MOST_ACCELERATION = 0.6
-"""Largest rim acceleration of a window that counts [m/s^2]; above it motion is not steady."""
+"""Largest rim acceleration of a window that is used [m/s^2]; above it the motion is not steady."""
 MOST_WINDOWS = 40
 """Largest number of windows in a segment.
 
@@ -52,7 +52,7 @@ class MultiFloorRuns:
     Attributes:
         windows: windows of every segment.
         floor: index of the floor under each wheel in the middle of each window.
-        counts: True for windows that count in the likelihood.
+        counts: True for windows that are used in the likelihood.
         runs: (name, sha256) of every run.
     """
 
@@ -69,13 +69,13 @@ def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Mul
     every surface of the maps and every load set-up of the runs.
 
     Raises:
-        DataError: no window of a map's runs counts, or only some runs log currents.
+        DataError: no window of the runs on a map can be used, or only some runs have currents.
     """
     cut = [_windows_on(data, floor, robot) for data, floor in sets]
     if len({(c.windows.has_current, c.windows.current_is_signed) for c in cut}) > 1:
         raise DataError(
-            "the sets of runs over several floors log currents, or their sign, differently; "
-            "expected all of them with signed, with unsigned or without currents"
+            "the sets of runs over several floors differ in the logged currents; expected signed "
+            "currents in all of them, or unsigned ones in all, or none"
         )
     floor, counts = (np.concatenate([getattr(c, f) for c in cut]) for f in ("floor", "counts"))
     first = np.cumsum([0, *(len(c.runs) for c in cut)])
@@ -103,7 +103,7 @@ _PER_WINDOW = ("dt", "turn", "speed_change", "current", "voltage", "current_var"
 
 
 def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> MultiFloorRuns:
-    """Return the windows of the runs on one map, each a segment of its own."""
+    """Return the windows of the runs on one map, each as a separate segment."""
     radius = float(robot.geometry.wheel_radius)
     w = _short(data, radius, float(robot.camera.lag))
     number = np.array([robot.surface_index(name) for name in floor.surfaces])
@@ -112,14 +112,15 @@ def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> MultiFloorRuns:
     if not counts.any():
         raise DataError(
             f"{data.logs[0].name} and the other runs over several floors: no window in which "
-            "wheels turn evenly and each keeps to its floor; expected larger patches or slower runs"
+            "wheel speeds are steady and each wheel stays on its floor; expected larger patches "
+            "or slower runs"
         )
     names = tuple((log.name, log.sha256) for log in data.logs)
     return MultiFloorRuns(w, under[:, 1:2], counts[:, None], names)
 
 
 def _short(data: Runs, radius: float, lag: float) -> Windows:
-    """Return the windows of every run, each a segment of its own; arguments as in `windows`."""
+    """Return the windows of every run, each as a separate segment; arguments as in `windows`."""
     each = []
     for k in range(len(data)):
         t = data.time[data.rows(k)]
@@ -141,7 +142,7 @@ def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Window
 
 
 def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "segment time wheel 2"]:
-    """Return wheel centres at start, middle and end of every segment's only window [m]."""
+    """Return wheel centres at start, middle and end of the single window of every segment [m]."""
     edges = np.asarray(lk.corrected(robot, jnp.asarray(w.pose)))
     pose = np.stack([edges[:, 0], edges.mean(axis=1), edges[:, 1]], axis=1)
     yaw = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])
@@ -166,7 +167,7 @@ class MultiFloorBatch(eqx.Module):
 
     Attributes:
         batch: windows, with the floor under each wheel.
-        counts: 1 for windows that count in the likelihood, else 0.
+        counts: 1 for windows that are used in the likelihood, else 0.
     """
 
     batch: lk.Batch
@@ -184,7 +185,7 @@ class MultiFloorBatch(eqx.Module):
         return replace(self, batch=replace(self.batch, surface=alone))
 
     def residuals(self, robot: Robot, p: lk.Predicted) -> dict[str, Array]:
-        """Return predicted less measured motion and, where they are logged, currents."""
+        """Return predicted less measured motion and, if they are logged, currents."""
         b = self.batch
         motion = lk.motion_residual(robot, b, p)
         out = {MULTI_FLOOR_MOTION: motion * jnp.repeat(self.counts, 3, axis=1)}
@@ -212,7 +213,7 @@ class WindowErrors(NamedTuple):
     Attributes:
         speed: error of the speed [m/s].
         yaw_rate: error of the yaw rate [rad/s].
-        current: error of the current [A], None where it was not logged.
+        current: error of the current [A], None if it was not logged.
     """
 
     speed: float
@@ -224,11 +225,11 @@ def window_errors(
     multi_floor: MultiFloorBatch,
     judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " segment"]]],
 ) -> WindowErrors:
-    """Return root mean square errors over all windows that count.
+    """Return root mean square errors over all windows that are used.
 
     Args:
-        judged: sets of residuals by block, each with weight 1 for the segments that are taken from
-            this set and 0 for the others.
+        judged: sets of residuals by block; each set has weight 1 for the segments whose residuals
+            are taken from it, and 0 for the others.
     """
     counts, dt = np.asarray(multi_floor.counts), np.asarray(multi_floor.batch.dt)
     motion, current, total = np.zeros(3), 0.0, 0.0

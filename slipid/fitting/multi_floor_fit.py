@@ -1,4 +1,4 @@
-"""Fit of runs over several floors together with the runs that each keep to one floor.
+"""Fit of runs over several floors together with the runs on one floor each.
 
 The runs over several floors are further segments of the same likelihood. Their predictions are
 judged on held-out runs: each half of them is predicted by a fit to the other half.
@@ -22,7 +22,7 @@ from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
 
 _ROUNDS = 6
-"""Largest number of rounds of each fit to half of the runs, which only serves to judge errors."""
+"""Largest number of rounds of each fit to half of the runs, which is only used to judge errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,8 @@ class MultiFloorFit:
         problem: problem of all runs.
         optimum: optimum of all runs.
         before: errors on the runs over several floors, predicted by the fit without any of them.
-        after: errors where each half of them is predicted by a fit to the other half, None where
-            there is only one run.
+        after: errors if each half of them is predicted by a fit to the other half; None if there is
+            only one run.
         learnt: errors on the same runs, predicted by the fit to all runs.
         as_if: errors, by floor, of predictions as if all wheels had always stood on this floor; a
             correct map predicts better.

@@ -1,14 +1,14 @@
-"""Variance components of the residuals of a segment, and the covariance that they add up to.
+"""Variance components of the residuals of a segment, and their sum, the covariance.
 
 The residuals of a segment have the covariance
 
     V = sum_c v_c B_c,   c over: camera position and heading noise, shared by neighbouring windows;
                          process noise along, across and in yaw, growing with distance, per floor;
-                         the run's own effect along, across and in yaw, per floor
+                         individual effect of the run along, across and in yaw, per floor
 
 with variances v_c and matrices B_c, so that the run effects are marginalised. Runs over several
-floors have variances of their own, as if they were driven on one more floor. Two kinds of variances
-are listed with these but are not part of V: those of effects that runs share
+floors have separate variances, as if they were driven on one more floor. Two kinds of variances are
+listed with these but are not part of V: those of effects that runs share
 (`slipid.fitting.shared_effects`), and that of the load biases of floors. Known variances, such as
 the ammeter's noise, are added.
 """
@@ -22,20 +22,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.windows import Windows
-from slipid.fitting.likelihood import FLOOR, Batch, ElectricNoise, voltage_std
+from slipid.fitting.likelihood import ROUNDING_VARIANCE, Batch, ElectricNoise, voltage_std
 from slipid.fitting.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION, MultiFloorRuns
 from slipid.model.robot import Robot
 
 
 class Components(eqx.Module):
-    """Covariance terms of one block of residuals and the variances they belong to.
+    """Covariance terms of one block of residuals, and the variances that multiply them.
 
     Attributes:
         base: covariance B_c of every segment and component at unit variance.
         which: index of the variance v_c of every segment and component.
         known: known variances of single residuals: rounding, and the ammeter's noise.
         segments: indices of the block's segments among all segments of a problem.
-        count: number of residuals of each segment that count in the likelihood.
+        count: number of residuals of each segment that are used in the likelihood.
     """
 
     base: Float[Array, "segment component m m"]
@@ -65,7 +65,7 @@ class Component:
     Attributes:
         kind: source of the noise, such as `process`.
         what: direction or channel, such as `along`.
-        floor: floor it belongs to, None for all floors.
+        floor: floor to which the component belongs, None for all floors.
         unit: unit of its std.
         typical: typical std, the centre of its weak log-normal prior.
     """
@@ -175,7 +175,7 @@ def electric_noise(
         return ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
     current, log_v = blocks["current"], jnp.asarray(log_variance)
     scatter = jnp.einsum("nc,nci->ni", jnp.exp(log_v)[current.which], current.single)
-    return ElectricNoise(voltage_std(log_v[-1]), scatter + FLOOR["current"], resistance)
+    return ElectricNoise(voltage_std(log_v[-1]), scatter + ROUNDING_VARIANCE["current"], resistance)
 
 
 def _multi_floor_components(
@@ -206,10 +206,10 @@ def _multi_floor_components(
 
 
 def _counted(of: Components, live: Bool[np.ndarray, "segment m"], first: int) -> Components:
-    """Return covariances in which residuals that do not count have variance 1 and no correlation.
+    """Return covariances in which unused residuals have variance 1 and no correlation.
 
     Args:
-        live: True for residuals that count; the others are set to zero elsewhere.
+        live: True for residuals that are used; the others are set to zero elsewhere.
         first: index of the first segment among all segments of the problem.
     """
     both = live[:, None, :, None] & live[:, None, None, :]
@@ -228,7 +228,7 @@ def _components(
     """Return components whose known variances are the rounding of the logs plus `more`.
 
     Args:
-        block: name of the block in `FLOOR`.
+        block: name of the block in `ROUNDING_VARIANCE`.
         base, which: as in `Components`.
         more: further known variances (segment, m).
     """
@@ -236,7 +236,7 @@ def _components(
     return Components(
         base=jax.device_put(base),
         which=jax.device_put(which),
-        known=jax.device_put(np.full((n, m), FLOOR[block]) + more),
+        known=jax.device_put(np.full((n, m), ROUNDING_VARIANCE[block]) + more),
         segments=jax.device_put(np.arange(n)),
         count=jax.device_put(np.full(n, float(m))),
     )
@@ -254,7 +254,7 @@ def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarr
     """Return the distance of each window by the encoders (segment, window) [m], and its direction.
 
     The distance includes the turn in radians times the base radius. The direction is a unit vector
-    in the body frame (segment, window, 2), ahead where the robot turns on the spot.
+    in the body frame (segment, window, 2), ahead if the robot turns on the spot.
     """
     step = encoder_increments(windows, robot)
     distance = np.linalg.norm(step[..., :2], axis=-1)

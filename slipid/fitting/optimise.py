@@ -1,4 +1,4 @@
-"""Maximum a posteriori fit by turns: Student-t weights, fitted numbers, and noise variances."""
+"""Maximum a posteriori fit, which alternates Student-t weights, numbers and noise variances."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ from slipid.fitting.variances import (
     scoring_step,
 )
 
-_REFUSED = 12
+_MOST_REFUSED = 12
 """Largest number of steps that the solver may refuse in a round."""
 
 
@@ -47,7 +47,7 @@ class Optimum:
         state: state after the last round.
         covariance: Laplace covariance of the search vector.
         converged: True if the last round changed less than the tolerance.
-        reason: reason why the fit stopped, as text for people.
+        reason: reason why the fit stopped, as a sentence.
         history: loss after every round, minus log posterior up to a constant.
     """
 
@@ -79,8 +79,8 @@ def optimise(
         tolerance: the fit stops after a round in which every fitted number changed by less than
             this many posterior stds, and every log variance by less than three times as much.
         tell: function called after every round, for progress and checkpoints.
-        free: 1 for coordinates that may move from the start, 0 for fixed ones (free,).
-        variances: whether the variances of the noise are fitted, too.
+        free: 1 for coordinates that may change from the start, 0 for fixed ones (free,).
+        variances: True if the variances of the noise are fitted, too.
     """
     keep = problem.full_weight if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
@@ -95,7 +95,7 @@ def optimise(
         if state.moved < tolerance:
             break
     covariance = problem.laplace(state.z, state.log_variance, keep)
-    reason = f"{most_rounds} rounds without settling"
+    reason = f"{most_rounds} rounds without convergence"
     if settled := state.moved < tolerance:
         reason = f"no number changed by {100 * tolerance:g} % of its std in round {state.round}"
     return Optimum(state, covariance, settled, reason, tuple(history))
@@ -137,7 +137,7 @@ def one_round(
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
     effect = effects_given(weighed.effects, root["motion"], whole["motion"])
-    # weights and effects depend on each other: a full step of both can oscillate for ever
+    # Weights and effects depend on each other, and full steps of both could oscillate forever.
     effect = 0.5 * (effect + before) if state.round else effect
     residual = without_effects(objective, whole, effect)
     voltage = problem.voltage_information(z, log_v, motor_force)
@@ -146,12 +146,16 @@ def one_round(
     for _ in range(scoring):
         log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), voltage)
         last, voltage = voltage, problem.voltage_information(z, log_v, motor_force)
-        if last is not None and voltage is not None:  # voltage residuals are scaled by their noise
+        if (
+            last is not None and voltage is not None
+        ):  # Voltage residuals are divided by their noise.
             scale = jnp.sqrt(voltage.share / last.share)
             residual = residual | {"voltage": voltage.residual}
             both = scale[:, :, None] * scale[:, None, :]
             spread = spread | {"voltage": spread["voltage"] * both}
-    if voltage is not None and scoring:  # a new noise does not merely rescale the derivative by R
+    if (
+        voltage is not None and scoring
+    ):  # A changed noise does not merely rescale the derivative by R.
         electric = problem.electric(z, log_v)
         whole, jacobian = problem.linear(z, electric)
     information = np.asarray(problem.precision(jacobian, log_v, keep))
@@ -186,7 +190,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)
     creep = space.where(lambda e: e.quantity == "surface.creep")
-    # far from the optimum every run is an outlier: start with wide variances
+    # Far from the optimum every run would be an outlier, so start with large variances.
     usual = {"camera": 1.0, "pooled": 1.0} | dict.fromkeys(SHARED, 0.1)
     wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
@@ -199,12 +203,18 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
-        for steps in (15, 6, 6):  # the solver's damping starts at 1, far below the problem's scale
+        for steps in (
+            15,
+            6,
+            6,
+        ):  # The damping of the solver starts at 1, far below the scale of the problem.
             state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
         found = problem.whitening(residual, state.log_variance, problem.full_weight)
-        cost = -np.log(np.asarray(found.weight["motion"]))  # loss per segment, up to scale, offset
+        cost = -np.log(
+            np.asarray(found.weight["motion"])
+        )  # loss per segment, up to a factor and an offset
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
             if mine < best[number]:
@@ -256,7 +266,7 @@ class RoundInputs(eqx.Module):
     slope: Float[Array, " free"]
 
 
-class Linearised(NamedTuple):
+class LinearisedResiduals(NamedTuple):
     """Whitened residuals of all blocks and of the prior, and their derivative by the step."""
 
     residual: Float[np.ndarray, " row"]
@@ -283,10 +293,12 @@ def levenberg(fixed: RoundInputs, steps: int) -> Search:
     """
     y = np.zeros(len(fixed.z))
     at, length, accepted = linearised(fixed, y), 1.0, 0
-    for _ in range(steps + _REFUSED - 1):
+    for _ in range(steps + _MOST_REFUSED - 1):
         a = at.jacobian.T @ at.jacobian + np.eye(len(y)) / length
         step = -np.linalg.solve(a, at.jacobian.T @ at.residual)
-        predicted = Linearised(at.residual + at.jacobian @ step, at.jacobian).loss - at.loss
+        predicted = (
+            LinearisedResiduals(at.residual + at.jacobian @ step, at.jacobian).loss - at.loss
+        )
         new = linearised(fixed, y + step)
         if not new.loss - at.loss <= 0.01 * predicted:
             length *= 0.25
@@ -309,12 +321,12 @@ def _at(fixed: RoundInputs, y: Vector) -> Vector:
     return fixed.z + fixed.mask * fixed.prior_std * y
 
 
-def linearised(fixed: RoundInputs, y: Search) -> Linearised:
+def linearised(fixed: RoundInputs, y: Search) -> LinearisedResiduals:
     """Return whitened residuals and their derivative after a step `y` from the start."""
     z = _at(fixed, y)
     given = GivenMotion(np.array(True), fixed.z, fixed.motor_force)
     residual, jacobian, _ = linear_given(fixed.objective, z, fixed.electric, given)
-    return Linearised(*map(np.asarray, _stacked(fixed, residual, jacobian, z)))
+    return LinearisedResiduals(*map(np.asarray, _stacked(fixed, residual, jacobian, z)))
 
 
 @eqx.filter_jit

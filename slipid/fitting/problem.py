@@ -50,11 +50,11 @@ From other values, fits have ended in poor local minima.
 """
 _NEAR_ZERO = 1e-4
 """Value of a viscous term that cannot be determined."""
-FEW = 200
-"""Largest number of segments for which `without_shared_effects` keeps the effects at zero size.
+MOST_FOR_ZERO_EFFECTS = 200
+"""Largest number of segments for which `without_shared_effects` keeps the effects with zero
+variance.
 
-Up to this number the extra arithmetic costs less time than compiling a fit without effects.
-"""
+Up to this number the extra arithmetic costs less time than compiling a fit without effects."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Problem:
     propagated. Otherwise a motor friction model that is accurate to 5 % of the current would
     overrule forces that motion determines to 1 %.
 
-    The argument `keep` of the methods is 1 for segments that count and 0 for others. `compiled`
+    The argument `keep` of the methods is 1 for segments that are used and 0 for others. `compiled`
     holds functions that other modules compiled for windows of these shapes, under their own keys.
     """
 
@@ -180,12 +180,14 @@ class Problem:
     def without_shared_effects(self) -> "Problem":
         """Return the same problem as if runs shared no effects.
 
-        Up to `FEW` segments, the effects stay in the problem with variance zero, so that the same
-        compiled fit serves both problems.
+        Up to `MOST_FOR_ZERO_EFFECTS` segments, the effects stay in the problem with variance zero,
+        so that the same compiled fit serves both problems.
         """
         other, shared = copy.copy(self), self.objective.shared
         none = tuple(replace(of, numbers=jnp.full_like(of.numbers, -1)) for of in shared)
-        other.objective = replace(self.objective, shared=none if len(self.windows) <= FEW else ())
+        other.objective = replace(
+            self.objective, shared=none if len(self.windows) <= MOST_FOR_ZERO_EFFECTS else ()
+        )
         return other
 
     @property
@@ -211,7 +213,7 @@ class Problem:
     ) -> Float[np.ndarray, "free free"]:
         """Return the covariance of the search vector: inverse information, prior included.
 
-        With `alone` every run counts as if it shared no effects with others.
+        With `alone`, every run is treated as if it shared no effects with others.
         """
         jacobian = self.linear(z, self.electric(z, log_v))[1]
         information = variances.precision(self.objective, jacobian, log_v, keep, alone)
@@ -250,7 +252,7 @@ class Problem:
     def voltage_information(
         self, z: Vector, log_v: Vector, motor_force: Array
     ) -> VoltageInformation | None:
-        """Return the information of voltages about variances, None where none are logged."""
+        """Return the information of voltages about variances, None if none are logged."""
         if "voltage" not in self.noise.blocks:
             return None
         return voltage_information(self.objective, z, log_v, motor_force)

@@ -1,8 +1,8 @@
-"""Effects that the runs of one session share beyond the model, and how they widen its covariance.
+"""Effects common to the runs of one session beyond the model, and the resulting larger covariance.
 
-Runs driven on one floor in one session slip a little more or less than the model predicts, all of
-them in the same sense. The slip models of the comparison are fitted as if runs were independent.
-After such a fit the remaining effects of its runs,
+Runs driven on one floor in one session all slip a little more, or all a little less, than the model
+predicts. The slip models of the comparison are fitted as if runs were independent. After such a fit
+the remaining effects of its runs,
 
     a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i     along, across, yaw
 
@@ -26,9 +26,9 @@ from slipid.data.windows import Windows
 from slipid.fitting.shared_effects import AXES
 from slipid.fitting.variances import DEGREES
 
-SPREAD = 3.0
+LOG_VARIANCE_STD = 3.0
 """Std of the prior of a session effect's log variance, centred on that of the run effects."""
-TURNS = 4
+ROUNDS = 4
 """Number of alternations between weights and variances."""
 
 
@@ -41,9 +41,9 @@ class LinearModel:
         slope: derivative of the increments by the fitted numbers.
         covariance: covariance of the fitted numbers.
         wide: covariance of the fitted numbers before the floor's own runs were used.
-        scale: noise covariance of `gap`, the run's own effect included.
+        scale: noise covariance of `gap`, including the individual effect of the run.
         effect: change of the increments per unit of an effect along, across and in yaw.
-        run: variance of the run's own effects along, across and in yaw.
+        run: variance of the individual effects of runs along, across and in yaw.
     """
 
     gap: Float[np.ndarray, "segment m"]
@@ -60,11 +60,11 @@ def with_session_effects(
 ) -> tuple[dict[str, float], Float[np.ndarray, "number number"]]:
     """Return variances `session.<floor>.<axis>`, and the numbers' covariance that includes them.
 
-    A floor driven in only one session has no such variances: what its runs have in common is then
+    A floor driven in only one session has no such variances: the common effect of its runs is then
     part of the floor's fitted numbers.
     """
     variance: dict[str, float] = {}
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         variance = _variances(model, w, keep, _weights(model, by_axis(variance, "session", w)))
     weighted = np.swapaxes(model.effect, 1, 2) @ np.linalg.solve(model.scale, model.slope)
     scores = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
@@ -82,7 +82,7 @@ def with_session_effects(
 def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "segment 3"]:
     """Return the variances of one kind of effect along, across and in yaw, for every segment.
 
-    They are zero where `variance` has no entry `<kind>.<floor>.<axis>`.
+    They are zero if `variance` has no entry `<kind>.<floor>.<axis>`.
     """
     return np.array([on_floor(variance, kind, floor) for floor in w.surface])
 
@@ -154,7 +154,7 @@ def _variance(left: np.ndarray, own: np.ndarray, member: np.ndarray, centre: flo
     Args:
         left: remaining effects of the runs.
         own: their covariance without shared effects.
-        member: 1 where a run belongs to a session, else 0 (run, session).
+        member: 1 if a run belongs to a session, else 0 (run, session).
         centre: centre of the prior of the log variance.
     """
     root = np.linalg.cholesky(own)
@@ -165,8 +165,8 @@ def _variance(left: np.ndarray, own: np.ndarray, member: np.ndarray, centre: flo
     def loss(log_v: float) -> float:
         grown = 1.0 + np.exp(log_v) * scale
         explained = np.exp(log_v) * np.sum(along**2 / grown)
-        deviation = (log_v - centre) / SPREAD
+        deviation = (log_v - centre) / LOG_VARIANCE_STD
         return float(0.5 * (np.log(grown).sum() - explained + deviation**2))
 
-    span = (centre - 4 * SPREAD, centre + 4 * SPREAD)
+    span = (centre - 4 * LOG_VARIANCE_STD, centre + 4 * LOG_VARIANCE_STD)
     return float(np.exp(minimize_scalar(loss, bounds=span, method="bounded").x))

@@ -1,7 +1,7 @@
 """Effects that neighbouring runs, and runs of one session, share beyond the model.
 
-Runs in nearly one direction at nearly one speed have similar errors, and so have runs of one
-session. The effect of a run along, across and in yaw is
+Runs in similar directions at similar speeds have similar errors, and so have runs of one session.
+The effect of a run along, across and in yaw is
 
     e = d(direction, speed, load) + s(session) + own
 
@@ -38,17 +38,17 @@ from slipid.model.robot import Robot
 
 AXES = ("along", "across", "yaw")
 """Names of the axes of an effect."""
-LENGTH = np.radians(10.0)
+DIRECTION_LENGTH = np.radians(10.0)
 """Length scale of the kernel over directions [rad]."""
 SPEED_LENGTH = 0.5
 """Length scale of the kernel over the natural logarithm of speed."""
-OTHER_LOAD = 0.5
+OTHER_LOAD_CORRELATION = 0.5
 """Correlation of effects with different load set-ups."""
-OTHER_SIDE = 0.7
+MIRROR_CORRELATION = 0.7
 """Correlation of effects in mirrored directions, h."""
 _HARMONICS = 15
 """Number of harmonics of the kernel over directions; higher ones hold 1 % of its variance."""
-_SPEED = 0.25
+_SPEED_STEP = 0.25
 """Step to which natural logarithms of speed are rounded."""
 
 
@@ -57,7 +57,7 @@ class SpeedAndLoad:
     """A speed and a load set-up that were driven on a floor.
 
     Attributes:
-        log_speed: natural logarithm of the speed in m/s, rounded to `_SPEED`.
+        log_speed: natural logarithm of the speed in m/s, rounded to `_SPEED_STEP`.
         load: load set-up.
     """
 
@@ -67,7 +67,9 @@ class SpeedAndLoad:
     def near(self, other: "SpeedAndLoad") -> float:
         """Return the correlation of effects in the same direction at another speed and load."""
         apart = (self.log_speed - other.log_speed) / SPEED_LENGTH
-        return float(np.exp(-0.5 * apart**2) * (1.0 if self.load == other.load else OTHER_LOAD))
+        return float(
+            np.exp(-0.5 * apart**2) * (1.0 if self.load == other.load else OTHER_LOAD_CORRELATION)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +77,7 @@ class TravelConditions:
     """Direction, speed and load of every segment, on which effects depend.
 
     Attributes:
-        direction: direction of travel relative to the body [rad], nan where a robot turns on the
-            spot.
+        direction: direction of travel relative to the body [rad], nan if a robot turns on the spot.
         speed_and_load: speed and load set-up.
         mirror: axis of `Geometry.mirror`.
     """
@@ -92,7 +93,7 @@ class TravelConditions:
         chord = np.hypot(*displacement.T)
         moves = chord > 0.2 * travel(w, robot)[0].sum(axis=1)
         speed = np.log(np.maximum(chord / w.dt.sum(axis=1), 1e-3))
-        rounded = np.round(speed / _SPEED) * _SPEED
+        rounded = np.round(speed / _SPEED_STEP) * _SPEED_STEP
         return TravelConditions(
             np.where(moves, np.arctan2(displacement[:, 1], displacement[:, 0]), np.nan),
             tuple(SpeedAndLoad(float(s), load) for s, load in zip(rounded, w.load, strict=True)),
@@ -110,8 +111,8 @@ class TravelConditions:
 
         Rows are zero where the robot turns on the spot.
         """
-        mirrored = 0.0 if self.mirror is None else OTHER_SIDE
-        wave = 1 / LENGTH**2
+        mirrored = 0.0 if self.mirror is None else MIRROR_CORRELATION
+        wave = 1 / DIRECTION_LENGTH**2
         k = np.arange(1, _HARMONICS + 1)
         angle = np.nan_to_num(self.direction - (self.mirror or 0.0))[:, None] * k
         size = np.sqrt(2 * ive(k, wave))
@@ -128,7 +129,7 @@ class TravelConditions:
         """Return a root of the whole kernel: effects per unit coefficient, for fitted conditions.
 
         `known` are the speeds and loads for which there are coefficients. A row has the same norm
-        as that of `around` where its speed and load are among them, and a smaller norm elsewhere.
+        as that of `around` if its speed and load are among them, else a smaller norm.
         """
         if not known:
             return np.zeros((len(AXES), len(self.speed_and_load), 0))
@@ -152,7 +153,7 @@ class SharedEffects(eqx.Module):
         effect: change of their residuals per unit of an effect along, across and in yaw.
         near: root of the kernel over driving conditions, by axis and segment.
         session: 1 in the column of each segment's session, else 0.
-        numbers: indices of the variances (own, neighbours', session; axis), -1 where there is none.
+        numbers: indices of the variances (own, neighbours', session; axis), -1 if there is none.
     """
 
     segments: Int[Array, " run"]
@@ -172,13 +173,13 @@ class SharedEffects(eqx.Module):
 
 
 SpeedsAndLoads = dict[str, tuple[SpeedAndLoad, ...]]
-"""Speeds and loads that each floor was driven with, by floor."""
+"""Speeds and loads of the runs on each floor, by floor."""
 
 
 def effects_by_floor(
     w: Windows, robot: Robot, noise: NoiseModel
 ) -> tuple[tuple[SharedEffects, ...], SpeedsAndLoads]:
-    """Return the shared effects of every floor, and the speeds and loads it was driven with."""
+    """Return the shared effects of every floor, and the speeds and loads of its runs."""
     conditions, moved = TravelConditions.of(w, robot), effects(w, robot)
     number = {name: k for k, name in enumerate(noise.names)}
     floors, found, speeds_and_loads = np.asarray(w.surface), [], {}

@@ -52,14 +52,14 @@ class Objective(eqx.Module):
     Attributes:
         space: free numbers and their prior.
         batch: runs on one floor each.
-        multi_floor: runs over several floors, None where there are none.
+        multi_floor: runs over several floors, None if there are none.
         blocks: covariance components of every block.
         shared: effects that the runs on each floor share.
         typical: centre of the prior of the log variances.
-        scored: True for variances that `scoring_step` estimates; run, shared and session effects
-            and load biases have estimators of their own (`slipid.fitting.hierarchy`).
+        scored: True for variances that `scoring_step` estimates; those of run, shared and session
+            effects and of load biases are estimated in `slipid.fitting.hierarchy`.
         pooled: index of the variance that is the prior variance of the space's pooled coordinates.
-        joint: True where no currents are logged, so that all numbers are estimated from motion.
+        joint: True if no currents are logged, so that all numbers are estimated from motion.
     """
 
     space: Space
@@ -124,7 +124,7 @@ def voltage_information(
         at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
         return lk.electric_residuals(robot, b, motor_force, at)["voltage"], lk.voltage_spread(b, at)
 
-    # a residual depends on the scatter of its own window only: one jvp gives all derivatives
+    # A residual depends only on the scatter of its window, so one jvp gives all derivatives.
     (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
     variance, m, wider = noise.voltage_std**2, r.shape[1], wider / spread
     weight = (DEGREES + m) / (DEGREES + jnp.sum(r**2, axis=1, keepdims=True) / variance)
@@ -137,7 +137,7 @@ def voltage_information(
 
 @eqx.filter_jit
 def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
-    """Return weights and whitening roots of residuals; `keep` is 1 for segments that count."""
+    """Return weights and whitening roots of residuals; `keep` is 1 for segments that are used."""
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
@@ -167,7 +167,7 @@ def precision(
 ) -> Array:
     """Return the expected information of the search vector, prior included (free, free).
 
-    Shared effects are marginalised; with `alone` every run counts as if it shared no effects.
+    Shared effects are marginalised; with `alone` every run is treated as if it shared no effects.
     """
     prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
     total, of_motion = prior, prior
@@ -201,7 +201,7 @@ def expected(m: Array | float | int) -> Any:
 def _cut(total: Array, of_motion: Array, e: Array) -> Array:
     """Return the information of p(motion | motion data) p(electric | motion, all data).
 
-    Where wheels stand on several floors, motion depends on their friction, which is one of the
+    If wheels stand on several floors, motion depends on their friction, which is one of the
     electric numbers `e`. The first factor marginalises friction as if currents contained no
     information about it, although the estimated motion does use the friction from currents. The
     intervals of the motion numbers are therefore somewhat too wide there.
@@ -278,7 +278,8 @@ def scoring_step(
             steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
         others = () if voltage is None else ("current",)
         if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT, *others):
-            # where a log variance falls, the loss curves more than expected, by the size of slope
+            # For decreasing log variances, the curvature of the loss exceeds the expected one by
+            # |slope|.
             steeper = steeper.at[which].add(-slope)
     score -= (log_v - objective.typical) / VARIANCE_SPREAD**2
     info = information(objective.blocks, log_v, keep, voltage)

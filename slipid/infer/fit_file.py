@@ -1,8 +1,8 @@
 """Files of a fit: fit.json, its arrays in an npz file named by their hash, and identified.json.
 
-identified.json is for people. One checksum covers the whole fit. An old fit is replaced in one
-step, the renaming of fit.json: if the process dies before, the old fit is intact; if it dies after,
-the new one is.
+identified.json is made for reading by people. One checksum covers the whole fit. An old fit is
+replaced in one step, the renaming of fit.json: if the process ends before that, the old fit is
+intact, and after that the new one.
 """
 
 import hashlib
@@ -41,7 +41,7 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
     """Write a fit to a folder, replacing the one there; return the names of the files.
 
     Raises:
-        ValueError: a number is not finite; nothing is written then.
+        ValueError: a number is not finite; in this case nothing is written.
         DataError: the folder cannot be written to.
     """
     arrays = _packed(fit)
@@ -52,7 +52,9 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
     content |= {"checksum": checksum(content)}
     table = json_text(identified_json(fit))
     write_bytes(folder / name, arrays)
-    write_bytes(folder / FIT, json_text(content).encode())  # from here on it is the new fit
+    write_bytes(
+        folder / FIT, json_text(content).encode()
+    )  # From here on, the folder contains the new fit.
     write_identified(folder, json.loads(table))
     for old in folder.glob("fit-????????????.npz"):
         if old.name != name:
@@ -90,8 +92,8 @@ def load(folder: Path) -> Fit:
     other = read_json(table, _RESULT) if table.exists() else {"fit": mark}
     if not isinstance(other, dict) or other.get("fit") != mark:
         raise DataError(
-            f"{table}: it belongs to another fit than {FIT} beside it, since writing was "
-            "interrupted; expected both of one fit (run `slipid identify` again)"
+            f"{table}: belongs to another fit than {FIT} in this folder, since writing was "
+            "interrupted; expected both from the same fit (run `slipid identify` again)"
         )
     return fit
 

@@ -1,6 +1,6 @@
 """Result of a fit: fitted numbers with intervals and verdicts on their identifiability.
 
-Modules that show, sample, deploy or write a fit are loaded when a method needs them.
+The modules for showing, sampling, deploying and writing a fit are loaded when a method needs them.
 """
 
 from collections.abc import Mapping
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 Evidence = TypeVar("Evidence")
 
 CONFLICT_STDS = 4.0
-"""Distance of a number from its prior mean above which a message warns [prior std]."""
+"""A message warns if a number is further than this from its prior mean [prior std]."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class Fit:
         Args:
             seed: seed of all random numbers.
             draws: number of draws kept from each ensemble.
-            most: number of blocks after which sampling ends without convergence.
+            most: number of blocks after which sampling ends even without convergence.
             plan: walkers and steps, in place of `seed` and `most`.
             quiet: show no progress.
         """
@@ -218,9 +218,9 @@ class Fit:
         """Compare slip models by cross-validation: each is refitted and scored on held-out runs.
 
         Args:
-            question: how runs are grouped: by `sectors` of 60 degrees of headings, by `speeds`, or
-                by `random` headings.
-            parts: number of folds, 2 at least. With 2, a fold is every second sector.
+            question: grouping of the runs that are held out together: `sectors` of 60 degrees of
+                headings, `speeds`, or `random` headings.
+            parts: number of folds, at least 2. With 2 folds, each consists of every second sector.
             quiet: show no progress.
 
         Raises:
@@ -253,7 +253,7 @@ class Fit:
         return deploy(self)
 
     def save(self, folder: Path | str) -> None:
-        """Write fit.json, its arrays and identified.json, each whole or not at all."""
+        """Write fit.json, its arrays and identified.json, each completely or not at all."""
         from slipid.infer import fit_file
 
         fit_file.save(self, Path(folder))
@@ -271,7 +271,7 @@ class Fit:
 
     @cached_property
     def contact(self) -> ForceBalance:
-        """The fit as a slip model that predicts runs."""
+        """The fitted force balance as a slip model, which predicts runs."""
         shared, extrapolation = self.shared, self.extrapolation
         return ForceBalance(
             self.robot, self.variance, self.covariance, self.space, self.z, shared, extrapolation
@@ -301,7 +301,7 @@ class Fit:
 
     @cached_property
     def disputes(self) -> dict[tuple[str, str], float]:
-        """Pairs of floors that disagree about the loads on the wheels, and by how much [std]."""
+        """Pairs of floors whose estimated wheel loads disagree, and their differences [std]."""
         return disputes(self.verdict_space, self.z, self.covariance)
 
     @cached_property
@@ -326,8 +326,8 @@ class Fit:
         """Warnings about the numbers, one sentence each."""
         found = [*sentences(self.flat)]
         found += [
-            f"{one} and {other} disagree about the loads on the wheels by {sigma:.1f} standard "
-            "errors of their noise: the contact law lacks something; intervals count it"
+            f"the wheel loads estimated on {one} and on {other} differ by {sigma:.1f} standard "
+            "errors of their noise: the contact law is incomplete; the intervals include this"
             for (one, other), sigma in self.disputes.items()
         ]
         found += [
@@ -336,8 +336,8 @@ class Fit:
             if e.verdict == "at_bound" and isinstance(e.value, float)
         ]
         found += [
-            f"{e.path} lies {abs(e.pull):.1f} prior stds from its prior: "
-            "the prior is wrong, or the model lacks something"
+            f"{e.path} is {abs(e.pull):.1f} prior stds away from its prior mean: the prior is "
+            "wrong, or the model is incomplete"
             for e in self.parameters.values()
             if e.pull is not None and abs(e.pull) > CONFLICT_STDS and e.verdict != "at_bound"
         ]
@@ -359,8 +359,8 @@ def required(evidence: Evidence | None) -> Evidence:
     """Return the argument; raise `ValueError` if it is None, as in a fit loaded from files."""
     if evidence is None:
         raise ValueError(
-            "this fit was loaded from its files, which hold neither runs nor their likelihood; "
-            "expected one that `fit` has made of runs"
+            "this fit was loaded from its files, which contain neither the runs nor their "
+            "likelihood; expected a fit that was just made by `fit` from runs"
         )
     return evidence
 

@@ -22,10 +22,10 @@ CURVE_POINTS = 41
 _STEADY = 0.1
 """Largest deviation of a steady command from the run's median command, relative to the latter."""
 _MOVED = 0.1
-"""Ratio of a window's speed to that of the fastest one above which the window counts as moving."""
+"""A window counts as moving if its speed exceeds this ratio of the speed of the fastest window."""
 _SECTOR, _COMMON = 30.0, 0.02
-"""Width of a sector of headings [deg], and the fraction of windows that makes a heading a driven
-one."""
+"""Width of a sector of headings [deg], and least fraction of the windows in a sector for its
+heading to count as driven."""
 _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
 
 
@@ -38,8 +38,8 @@ class SlipCurve:
         slip: slip at each torque.
         slip_lo: lower end of the 90 % band.
         slip_hi: upper end of the 90 % band.
-        wheel_speed: wheel speed that the curve is computed for [rad/s].
-        load_share: share of the weight on the wheel that the curve is computed for.
+        wheel_speed: wheel speed for which the curve is computed [rad/s].
+        load_share: share of the weight on the wheel for which the curve is computed.
     """
 
     torque_nm: Float[np.ndarray, " torque"]
@@ -131,7 +131,7 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """Return the ranges of speed, torque, slip and motion that the runs on each floor cover."""
     speed, torque, slip = wheel_states(robot, b)
     back = np.asarray(robot.geometry.pseudo_inverse()) * float(robot.geometry.wheel_radius)
-    # ranges are those of the motion by the encoders, without slip
+    # The ranges refer to the motion computed from the encoders without slip.
     twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T
     yaw = twist[..., 2]
     floor, length = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
@@ -185,7 +185,7 @@ def by_encoders(
     angle = np.degrees(np.arctan2(twist[ahead, 1], twist[ahead, 0]))
     headings, count = np.unique((np.round(angle / _SECTOR) * _SECTOR) % 360.0, return_counts=True)
     common = headings[count >= _COMMON * count.sum()]
-    signed = np.where(common > 180.0, common - 360.0, common)  # as commands have them
+    signed = np.where(common > 180.0, common - 360.0, common)  # rounded like commands
     parts = (0.1, 0.5, 0.9)
     speeds = np.quantile(speed[ahead], parts) if ahead.any() else np.zeros(0)
     rates = np.quantile(twist[on, 2], parts) if on.any() else np.zeros(0)

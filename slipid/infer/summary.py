@@ -29,7 +29,7 @@ def summarise(
     Args:
         problem: likelihood of the runs.
         optimum: end of the search.
-        data: runs on one floor each that the problem's windows were cut from.
+        data: runs on one floor each, from which the windows of the problem were made.
         choices: user's choices that the problem was built with.
         seed: seed of the draws from which the bands of the curves are computed.
     """
@@ -37,7 +37,7 @@ def summarise(
     contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.full_weight)
     remaining, name = _remaining(problem, optimum)
     settled = remaining < LARGEST_REMAINING
-    stuck = f"the solver stopped {remaining:.2g} stds of {name} away from where its own step leads"
+    stuck = f"the solver stopped although its next step would change {name} by {remaining:.2g} stds"
     windows, robot = problem.windows, contact.robot
     several = draws(z, contact.covariance, 400, seed)
     unit = {c.name: c.unit for c in problem.noise.components}

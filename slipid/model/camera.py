@@ -19,8 +19,8 @@ class Camera(eqx.Module):
     Logged positions are corrected by `corrected`: true = scale * Q(q), with q measured from the
     image centre and Q(q) = (q (1 + k q.q) + p q.q + 2 q (p.q)) / (1 + tilt.q): perspective of a
     tilted camera, radial and tangential distortion (Brown 1966, Conrady 1919; first order of each).
-    The marker's heading is the body's plus `marker_yaw`, plus a deviation for each session in which
-    the marker was mounted anew.
+    The marker's heading is the body's plus `marker_yaw`, plus a deviation for each session, since
+    the marker may have been mounted again.
     """
 
     scale: Array = known("1", "s", "true over logged length", start=1.0, lower=0.0, spread=0.02)
@@ -42,7 +42,7 @@ class Camera(eqx.Module):
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 
     def corrected(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return a logged pose in true metres, the heading rotated as the map rotates directions.
+        """Return a logged pose in true metres, with the heading rotated as the map rotates there.
 
         The heading is still that of the marker: the marker yaw is not subtracted.
         """
@@ -54,8 +54,8 @@ class Camera(eqx.Module):
     def logged(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return the logged pose of a true pose: the inverse of `corrected`, by iteration.
 
-        Every iteration reduces the error to the fraction by which the map is not linear, a few
-        percent across an image.
+        Every iteration multiplies the error by the relative nonlinearity of the map, a few percent
+        across an image.
         """
         step = jnp.stack([self.scale, self.scale, jnp.ones(())])
         q = (pose / step).at[:2].add(jnp.asarray(self.centre))

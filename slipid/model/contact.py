@@ -1,8 +1,8 @@
 """Contact equilibrium: the twist at which wheel traction, roller drag and scrub balance.
 
 The forces are those of `slipid.model.contact_law`. The root of their balance is found by a fixed
-number of chord steps, which come near it from anywhere, followed by damped Newton steps with the
-analytic 3x3 Jacobian; its derivative comes from the implicit function theorem.
+number of chord steps, which approach it from any start, followed by damped Newton steps with the
+analytic 3x3 Jacobian; its derivative follows from the implicit function theorem.
 """
 
 from collections.abc import Callable
@@ -26,11 +26,11 @@ _DAMPING = (1.0, 0.3, 0.05)
 """Factors of Newton's step that are tried in each damped step."""
 _ROUNDING = 1e-20
 """Squared residual force [(mu m g)^2] below which no better step exists because of rounding."""
-_NEAR = 1e-6
+_CONVERGED_STEP = 1e-6
 """Largest component of the last step with which `_solve_near` has converged [m/s], [rad/s]."""
-_MOST_NEAR = 12
+_MOST_NEAR_STEPS = 12
 """Largest number of Newton steps of `_solve_near`."""
-CHORD, NEWTON = 4, 2
+SETTLE_CHORD_STEPS, SETTLE_NEWTON_STEPS = 4, 2
 """Numbers of chord and of Newton steps that `settle` takes from the previous time step's twist.
 
 With wheel speeds that change by up to 1.25 rad/s per time step and three floors, 99 % of all twists
@@ -99,7 +99,7 @@ def _solve_near(problem: ContactProblem) -> Float[Array, "3"]:
 
     def far(state: tuple[Array, Array, Array]) -> Array:
         _, step, count = state
-        return (jnp.max(jnp.abs(step)) > _NEAR) & (count < _MOST_NEAR)
+        return (jnp.max(jnp.abs(step)) > _CONVERGED_STEP) & (count < _MOST_NEAR_STEPS)
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         xi, _, count = state
@@ -108,7 +108,7 @@ def _solve_near(problem: ContactProblem) -> Float[Array, "3"]:
 
     first = (problem.start, jnp.full(3, jnp.inf), jnp.zeros((), int))
     xi, step, _ = jax.lax.while_loop(far, newton, first)
-    return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
+    return jnp.where(jnp.max(jnp.abs(step)) > _CONVERGED_STEP, jnp.nan, xi)
 
 
 OneProblem = tuple[ContactProblem]
@@ -158,8 +158,8 @@ def equilibrium(
         surface: one floor, or one under each wheel.
         rest: load shares at rest, sum 1.
         near: a twist so close to the root that plain Newton steps converge, which is about ten
-            times cheaper; the result is NaN where they do not. The last step is below 1e-6 m/s or
-            rad/s, so that the remaining error is of the order of its square.
+            times cheaper; the result is NaN if they do not converge. The last step is below 1e-6
+            m/s or rad/s, so that the remaining error is of the order of its square.
 
     Source: the balance at the head of `slipid.model.contact_law`.
     """
@@ -173,10 +173,10 @@ def settle(
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
     """Return the equilibria on many floors at once, and the tractions, from recent twists.
 
-    A few chord steps are followed by Newton steps, which are kept where they reduce the residual
-    force; the fixed small number of steps suits a robot's own computer. Where the result is not
-    finite, the twist is that without slip. The error that remains after a jump of the wheel speeds
-    is removed in the following calls.
+    A few chord steps are followed by Newton steps, which are kept if they reduce the residual
+    force; the small fixed number of steps suits the computer of a robot. If the result is not
+    finite, the twist without slip is returned. The error that remains after a jump of the wheel
+    speeds is removed in the following calls.
 
     Args:
         start: twists [m/s, m/s, rad/s].
@@ -193,10 +193,12 @@ def settle(
     def chord(xi: Planar, _: None) -> tuple[Planar, None]:
         return balance.chord(xi), None
 
-    # unrolled for XLA; generated C code keeps the loop
-    near, _ = jax.lax.scan(chord, Planar(*start), length=CHORD, unroll=CHORD)
+    # unrolled for XLA; a loop in the generated C code
+    near, _ = jax.lax.scan(
+        chord, Planar(*start), length=SETTLE_CHORD_STEPS, unroll=SETTLE_CHORD_STEPS
+    )
     xi = near
-    for _ in range(NEWTON):
+    for _ in range(SETTLE_NEWTON_STEPS):
         xi = jax.tree.map(jnp.subtract, xi, balance.newton(xi))
     # a comparison with NaN is false, so that NaN is never nearer
     nearer = balance.size(balance.force(xi)) <= balance.size(balance.force(near))

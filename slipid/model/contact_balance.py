@@ -22,7 +22,7 @@ _LEAST_LOAD = 1e-3
 
 
 class Stance(eqx.Module):
-    """A robot standing on its floors: geometry, loads and floor numbers of every wheel.
+    """A robot on its floors: geometry, loads and floor parameters of every wheel.
 
     Attributes:
         frame, rest: wheel directions and apparent load shares at rest, with an axis for the batch.
@@ -66,7 +66,7 @@ def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel
         )
     roller_scale = (1 - frame.grip) * floor.friction * floor.roller_drag / len(rest)
     floor, onset = law.sideways(law.at_load(floor, len(rest) * rest), frame.grip)
-    # components are the first axis: XLA then keeps each, and its derivatives, contiguous
+    # Components are the first axis, so that XLA stores each, and its derivatives, contiguously.
     hold, roll, shift = (jnp.moveaxis(r, 1, 0) for r in (frame.hold, frame.roll, frame.shift))
     return Stance(
         frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction, roller_scale
@@ -135,7 +135,7 @@ class Balance(eqx.Module):
         near the root they converge slowly.
         """
         on, f, w = self.on, self.on.frame, self.wheels(*self._speeds(xi))
-        # a lifted wheel's load share is negative, which would give its chords the wrong sign
+        # A lifted wheel has a negative load share, which would give its chords the wrong sign.
         load = law.load_force(jnp.maximum(self.share(xi), _LEAST_LOAD), on.floor)
         pulls, rolls = load * w.traction.chord(), load * w.drag.chord()
         both = pulls + load * w.resistance.chord()
@@ -152,7 +152,7 @@ class Balance(eqx.Module):
         return solve3(m, drive)
 
     def motor_force(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Return the traction that each motor works against [mean(mu) m g]."""
+        """Return the traction against which each motor works [mean(mu) m g]."""
         f = self.on.frame
         return self.load(xi) * self.wheels(*self._speeds(xi)).motor_force(
             f.drive_share, f.roller_share

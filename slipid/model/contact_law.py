@@ -68,7 +68,8 @@ positive = partial(parameter, lower=0.0)
 class ContactSurface(eqx.Module):
     """Parameters of a floor under rolling wheels; leaves may be stacked, one row per label.
 
-    In the force balance leaves are numbers, or one per wheel where wheels stand on several floors.
+    In the force balance a leaf is a single number, or an array (wheel,) if wheels are on several
+    floors.
 
     Attributes:
         labels: names of the stacked surfaces.
@@ -161,20 +162,20 @@ class Friction(eqx.Module):
     def by_speed(self) -> Array:
         """Return the derivative by the speed at a constant activity."""
         if self.beside is None:
-            return self._steep() / self.onset + self.viscosity
-        return self.top * (self._slope() + self._bent() * self.speed**2) + self.viscosity
+            return self._top_slope() / self.onset + self.viscosity
+        return self.top * (self._slope() + self._slope_change() * self.speed**2) + self.viscosity
 
     def by_beside(self) -> Array | float:
         """Return the derivative of the force by the sliding at right angles, `beside`."""
         if self.beside is None:
             return 0.0
-        return self.top * self._bent() * self.speed * self.beside
+        return self.top * self._slope_change() * self.speed * self.beside
 
     def by_activity(self) -> Array:
         """Return the derivative by the wheel's activity at a constant speed."""
-        return -(self._steep() / self.onset) * (self.speed / self.onset) * self.ratio
+        return -(self._top_slope() / self.onset) * (self.speed / self.onset) * self.ratio
 
-    def _steep(self) -> Array:
+    def _top_slope(self) -> Array:
         """Return top (1 - tanh^2(m / onset)), the slope of the saturating term times the onset."""
         return self.top * (1 - jnp.tanh(self._size() / self.onset) ** 2)
 
@@ -188,7 +189,7 @@ class Friction(eqx.Module):
         """Return tanh(m / onset) / m."""
         return jnp.tanh(self._size() / self.onset) / self._size()
 
-    def _bent(self) -> Array:
+    def _slope_change(self) -> Array:
         """Return the derivative of `_slope` by m, divided by m."""
         m = self._size()
         steep = (1 - jnp.tanh(m / self.onset) ** 2) / self.onset

@@ -27,8 +27,8 @@ class Drives(eqx.Module):
     """Wheels and the drives that turn them.
 
     Attributes:
-        drive_of: number of the drive that turns each wheel, from 0 (wheel,); empty where every
-            wheel has its own.
+        drive_of: index of the drive that turns each wheel, from 0 (wheel,); empty if every wheel
+            has a separate drive.
     """
 
     drive_of: eqx.AbstractVar[tuple[int, ...]]
@@ -107,9 +107,10 @@ class Geometry(Drives):
         for k, (angle, grip) in enumerate(zip(self.roller_angle, self.grips, strict=True)):
             if not grip and abs(math.sin(angle)) < 0.05:
                 raise ValueError(
-                    f"wheel {k + 1}: rollers at {math.degrees(angle):g} deg to the drive direction "
-                    "run freely along it, such a wheel cannot drive (singular; Indiveri 2009); "
-                    "expected 90 (omni), 45 (mecanum) or anything away from 0 and 180"
+                    f"wheel {k + 1}: rollers at {math.degrees(angle):g} deg to the drive "
+                    "direction run freely along it, so that the wheel cannot drive (singular; "
+                    "Indiveri 2009); expected 90 (omni), 45 (mecanum) or another angle that is "
+                    "not near 0 or 180"
                 )
 
     @property
@@ -118,7 +119,7 @@ class Geometry(Drives):
 
     @property
     def determines_twist(self) -> bool:
-        """Whether the wheel rotations determine x, y and yaw if nothing slips."""
+        """True if the wheel rotations determine x, y and yaw if nothing slips."""
         return int(np.linalg.matrix_rank(np.asarray(self.forward()), tol=1e-6)) == 3
 
     def frame(self) -> "WheelFrame":
@@ -145,7 +146,7 @@ class Geometry(Drives):
         return (*order[first:], *order[:first])
 
     def mirror(self) -> float | None:
-        """Return the axis about which the wheels are their own mirror image [rad], or None.
+        """Return the axis about which the arrangement of wheels is symmetric [rad], or None.
 
         The longitudinal axis (0) is tried before the lateral one (pi / 2). Wheels are compared by
         their positions and by the lines of their drives and rollers, with the tolerance `_MIRRORED`
@@ -154,7 +155,7 @@ class Geometry(Drives):
         drive = np.asarray(self.drive_angle)
         free = np.where(self.grips, drive, drive - np.asarray(self.roller_angle))
         place = np.asarray(self.place) @ (1, 1j)
-        # a line is the same after half a turn, hence the doubled angles
+        # A line is the same after half a turn, hence the doubled angles.
         wheels = np.stack([place, np.exp(2j * drive), np.exp(2j * free)], axis=1)
         for axis in (0.0, 0.5 * math.pi):
             mirrored = np.exp(2j * axis * np.array([1, 2, 2])) * wheels.conj()
@@ -176,7 +177,7 @@ class Geometry(Drives):
 
 
 class WheelFrame(Drives):
-    """Wheel directions and levers as the force balance uses them.
+    """Wheel directions and levers for the force balance.
 
     Attributes:
         hold: rows that give, from the body twist, the speed of each wheel centre along the
@@ -333,13 +334,13 @@ def general(
         roller_deg: angle from the rollers' free direction to the drive [deg], None without rollers.
         wheel_radius: radius of the wheels [m].
         gear_ratio: motor speed over wheel speed.
-        drive_of: index of the drive that turns each wheel, from 0; empty where every wheel has a
-            drive of its own.
+        drive_of: index of the drive that turns each wheel, from 0; empty if every wheel has a
+            separate drive.
     """
     p = np.asarray(place, float)
     base = float(np.sqrt((p**2).sum(axis=1).mean()))
     if base <= 0:
-        raise ValueError("all wheels stand at the origin; expected their centres in metres")
+        raise ValueError("all wheels are at the origin; expected their centres in metres")
     return Geometry(
         wheel_radius=as_numbers(wheel_radius),
         base_radius=as_numbers(base),

@@ -13,12 +13,11 @@ electric = partial(parameter, electric=True)
 REST = 2.5
 """Motor speed w0 below which the sign of the speed is unreliable [rad/s].
 
-It is about the resolution of the speed signal.
-"""
+It is about the resolution of the speed signal."""
 
 
 held = partial(electric, free=False)
-"""Declaration of an electric number that is fixed unless the user frees it."""
+"""Declaration of an electric parameter that is fixed unless the user frees it."""
 
 
 class Motor(eqx.Module):

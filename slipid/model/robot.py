@@ -74,7 +74,7 @@ class Robot(eqx.Module):
             base_radius: distance of the wheel centres from the middle [m].
             wheel_radius: radius of the wheels [m].
             gear_ratio: motor turns per wheel turn.
-            mass: mass of the robot, which scales torques [kg].
+            mass: mass of the robot, to which torques are proportional [kg].
         """
         azimuths = [float(a) for a in azimuth_deg]
         sizes = float(base_radius), float(wheel_radius), float(gear_ratio)
@@ -95,7 +95,7 @@ class Robot(eqx.Module):
     ) -> "Robot":
         """Return the same robot for these floors, load set-ups and sessions, at start values.
 
-        `image_centre` is where the camera's tilt and distortion are zero [m].
+        `image_centre` is the point at which the camera's tilt and distortion are zero [m].
         """
         made = build(self.geometry, surfaces, loads, sessions, image_centre)
         return replace(made, motor=self.motor, body=replace(made.body, mass=self.body.mass))
@@ -201,8 +201,8 @@ class Validity:
         slip: smallest and largest slip.
         yaw_rate: smallest and largest yaw rate by the encoders [rad/s].
         headings_deg: directions of travel in the body frame that were driven [deg]. Headings,
-            speeds and turn rates are commanded values, or approximate values from the encoders
-            where no steady command was logged.
+            speeds and turn rates are commanded values, or approximate values from the encoders if
+            no steady command was logged.
         speeds: speeds of the body that were driven [m/s].
         turn_rates: yaw rates of the body that were driven [rad/s].
         distance: mean distance of a run [m].

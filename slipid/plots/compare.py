@@ -12,27 +12,27 @@ from slipid.support.content import Content
 
 TIED = "#cfe3f1"
 SHOWN = {
-    "sectors": "60-degree sectors of headings left out",
-    "speeds": "one speed left out",
-    "random": "random headings left out",
+    "sectors": "60-degree sectors of headings held out",
+    "speeds": "one speed held out",
+    "random": "random headings held out",
 }
 MODEL_NAMES = {
     "identified": "identified (force balance)",
     "nominal": "encoders, sizes as in the config",
     "encoder": "encoders, sizes as fitted",
-    "constant": "one slip for all",
+    "constant": "constant slip",
     "linear": "slip ~ torque",
     "affine": "slip ~ 1 + torque",
     "svr": "slip ~ 1 + torque, SVR",
     "quadratic": "slip ~ 1 + torque + torque²",
     "saturating": "slip ~ saturating torque",
-    "monotone_spline": "slip ~ any rising curve of torque",
+    "monotone_spline": "slip ~ monotone curve of torque",
     "affine_current": "slip ~ 1 + current",
     "heading_lookup": "lookup by heading",
     "effective_track": "effective radius and track",
     "instantaneous_centres": "instantaneous centres",
-    "full_linear": "any linear kinematics",
-    "paper": "form of 2021, refitted",
+    "full_linear": "general linear kinematics",
+    "paper": "form of the 2021 paper, refitted",
 }
 
 
@@ -65,7 +65,7 @@ def compare_figure(floors: Content, which: str) -> Figure:
         errors = {model: 100 * one["endpoint_error"] for model, one in answer["models"].items()}
         stds = [200 * (one["endpoint_error_se"] or 0.0) for one in answer["models"].values()]
         _bars(error, errors, stds)
-        error.set_xlabel("mean end-point error\n[% of displacement], less is better")
+        error.set_xlabel("mean end-point error\n[% of displacement], lower is better")
         for k, one in enumerate(answer["models"].values()):
             if one["verdict"] in ("best", "tied"):
                 for ax in (density, error):
@@ -74,7 +74,7 @@ def compare_figure(floors: Content, which: str) -> Figure:
         axes[row, 0].set_yticks(range(len(models)), _readable(models))
     axes[0, 0].set_ylim(len(models) - 0.4, -0.6)
     made.supxlabel(
-        "error bars: two standard errors, runs of one 30-degree sector of headings counted as one",
+        "error bars: two standard errors, clustered by 30-degree sectors of headings",
         fontsize=9,
         color=drawing.SHADE,
     )
@@ -83,7 +83,7 @@ def compare_figure(floors: Content, which: str) -> Figure:
 
 def _density(ax: Axes, models: Content) -> None:
     drawing.plain(ax)
-    ax.set_xlabel("log density less the best's\n[nats per run], more is better")
+    ax.set_xlabel("log density less that of the best\n[nats per run], higher is better")
     reach: list[float] = []
     for k, (model, one) in enumerate(models.items()):
         at, bar, colour = one["difference"], 2 * (one["se_clustered"] or 0.0), _colour_of(model)
@@ -119,7 +119,7 @@ def validation_figure(found: Content, which: str) -> Figure:
 
 
 def _readable(models: Sequence[str]) -> list[str]:
-    """Return the names of models as a reader should see them."""
+    """Return the names of models in words."""
     return [MODEL_NAMES.get(model, model.replace("_", " ")) for model in models]
 
 

@@ -40,7 +40,7 @@ def design_figure(found: Design) -> Figure:
         spare.remove()
     words = "numbers: order of the runs (x3: three times)\nbent or round arrows: runs with a turn"
     left.supxlabel(f"{words}\ngray dots: runs of the fit", fontsize=9, color=drawing.SHADE)
-    _falling(right.subplots(), found.content["runs_saved"]["paper_grid"])
+    _uncertainty_curves(right.subplots(), found.content["runs_saved"]["paper_grid"])
     return made
 
 
@@ -49,9 +49,9 @@ def _title(found: Design) -> str:
     names = [g["name"] for g in goals[:2]] + ["..."] * (len(goals) > 2)
     last = found.content["runs"][-1]["expected"]
     kept = math.sqrt(found.content["criterion"][-1])
-    head = f"Drive these {len(found.runs)} runs next to know more of {', '.join(names)}\n"
+    head = f"Next {len(found.runs)} runs, to reduce the uncertainty of {', '.join(names)}\n"
     if len(goals) > 1:
-        return head + f"uncertainty falls to {kept:.0%} of what it is now"
+        return head + f"uncertainty falls to {kept:.0%} of its present value"
     g = goals[0]
     scale, unit = (100, " %") if g["unit"] == "m/m" else (1, "" if g["unit"] == "1" else g["unit"])
     return head + f"std falls from {scale * g['now']:.3g} to {scale * last[g['name']]:.3g}{unit}"
@@ -120,7 +120,7 @@ def _colour(d: PlannedRun) -> str:
     return drawing.ORANGE if d.turn > 0 else drawing.GREEN
 
 
-def _falling(ax: Axes, saved: Content) -> None:
+def _uncertainty_curves(ax: Axes, saved: Content) -> None:
     """Draw each curve of the uncertainty over the number of runs, without earlier data."""
     for key, colour, style, label in CURVES:
         curve = saved["curves"][key]

@@ -20,7 +20,7 @@ STYLES = tuple(zip(SERIES, ("o", "^", "s", "D", "v", "P"), strict=True))
 
 
 def figure(width: float, height: float, title: str) -> Figure:
-    """Return an empty figure of this size [inch], with a title that states its message."""
+    """Return an empty figure of this size [inch] with a title."""
     made = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(made)
     made.suptitle(title, fontsize=13, x=0.01, ha="left", color=INK)
@@ -37,7 +37,7 @@ def panels(count: int, width: float, height: float, title: str) -> tuple[Figure,
     """Return a figure with `count` panels of the same size [inch], in rows of at most four."""
     columns = min(count, 4 if count != 5 else 3)
     rows = math.ceil(count / columns)
-    # the figure is wide enough for the title even with a single panel
+    # The figure is wide enough for the title even with a single panel.
     made = figure(max(width * columns, 8.8), height * rows + 0.6, title)
     axes = list(made.subplots(rows, columns, squeeze=False).flat)
     for spare in axes[count:]:

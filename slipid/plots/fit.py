@@ -28,7 +28,7 @@ def raw_plots(data: Runs, out: Path) -> list[Path]:
 
 
 def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as logged") -> Figure:
-    """Draw paths, wheel speeds and currents of runs on top of one another.
+    """Draw paths, wheel speeds and currents of all runs in the same axes.
 
     Args:
         data: all runs.
@@ -95,12 +95,12 @@ def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
         along = np.array([np.cos(angle), np.sin(angle)])
         side = np.array([-along[1], along[0]]) * 0.35 * radius
         ends = (radius * along + side, radius * along - side)
-        corners = [_up(p + corner) for corner in (*ends, -ends[0], -ends[1])]
+        corners = [_xy(p + corner) for corner in (*ends, -ends[0], -ends[1])]
         size = reach * 0.62 * np.sqrt(share[k])
-        ax.add_patch(Circle(_up(p), size, fc=drawing.BLUE, alpha=0.25, ec="none"))
+        ax.add_patch(Circle(_xy(p), size, fc=drawing.BLUE, alpha=0.25, ec="none"))
         ax.add_patch(Polygon(corners, fc=drawing.INK, ec="none"))
-        ax.text(*_up(p * [1.75, 1.95]), _words(k, estimate), ha="center", va="center", fontsize=10)
-    ax.plot(*_up(share @ place), "X", color=drawing.ORANGE, ms=11, mec="white")
+        ax.text(*_xy(p * [1.75, 1.95]), _label(k, estimate), ha="center", va="center", fontsize=10)
+    ax.plot(*_xy(share @ place), "X", color=drawing.ORANGE, ms=11, mec="white")
     ahead, left = 1000 * (share @ place)
     where = f"{abs(ahead):.0f} mm {'ahead of' if ahead > 0 else 'behind'} the middle"
     if abs(left) >= 0.5:
@@ -112,12 +112,12 @@ def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
     ax.axis("off")
 
 
-def _up(p: np.ndarray | Sequence[float]) -> tuple[float, float]:
+def _xy(p: np.ndarray | Sequence[float]) -> tuple[float, float]:
     """Return the position on the page of a body position (x, y); x is up and y to the left."""
     return -float(p[1]), float(p[0])
 
 
-def _words(k: int, estimate: Estimate) -> str:
+def _label(k: int, estimate: Estimate) -> str:
     text = f"wheel {k + 1}\n{100 * estimate.value[k]:.1f} %"
     if estimate.interval90 is not None:
         low, high = estimate.interval90[k]

@@ -1,4 +1,4 @@
-"""Picture for checking a floor map: the photograph with outlines of patches, beside the map."""
+"""Figure for checking a floor map: the photograph with outlines of patches, next to the map."""
 
 from pathlib import Path
 from textwrap import shorten
@@ -27,7 +27,7 @@ def floor_plot(
     in_view: Bool[np.ndarray, "row column"],
     path: Path,
 ) -> Path:
-    """Write a picture of the rectified photograph with outlines and names, beside the map.
+    """Write a figure of the rectified photograph with outlines and names, next to the map.
 
     Args:
         vector: the map.
@@ -35,7 +35,7 @@ def floor_plot(
         in_view: True for cells that the camera sees.
         path: file of the picture.
     """
-    known = f"{100 * (1 - vector.region.unknown_share):.0f} % of its rectangle known"
+    known = f"{100 * (1 - vector.region.unknown_share):.0f} % of the rectangle is known"
     surfaces, patches = len(vector.region.colours), len(vector.patches)
     title = f"Map of the floor: {surfaces} surfaces, {patches} patches, {known}"
     low_x, low_y, high_x, high_y = vector.region.extent_m
@@ -45,7 +45,7 @@ def floor_plot(
     extent = (low_x, high_x, low_y, high_y)
     shown = np.dstack([photograph[..., ::-1], np.where(in_view, 255, 0)]).astype(np.uint8)
     step = max(1, max(shown.shape[:2]) // 1200)
-    for axes, name in ((left, "photograph, laid onto the floor"), (right, "map")):
+    for axes, name in ((left, "photograph, projected onto the floor"), (right, "map")):
         axes.set_title(name, fontsize=10, loc="left")
         axes.add_patch(_unknown(vector))
         axes.set(xlabel="x [m]", aspect="equal", xlim=extent[:2], ylim=extent[2:])
@@ -61,7 +61,7 @@ def floor_plot(
 
 
 def _unknown(vector: VectorMap) -> Rectangle:
-    """Return a hatched rectangle as large as the map, which shows through where it is unknown."""
+    """Return a hatched rectangle as large as the map, visible where the floor is unknown."""
     low_x, low_y, high_x, high_y = vector.region.extent_m
     corner, size = (low_x, low_y), (high_x - low_x, high_y - low_y)
     return Rectangle(corner, *size, facecolor="white", edgecolor=SHADE, hatch=HATCH, lw=0, zorder=0)
@@ -82,7 +82,7 @@ def _outline(axes: Axes, patch: Patch, colour: str | None) -> None:
 
 
 def _names(axes: Axes, vector: VectorMap) -> None:
-    """Write the name of each large patch where it has most room."""
+    """Write the name of each large patch in its widest part."""
     low_x, low_y, high_x, high_y = vector.region.extent_m
     whole = (high_x - low_x) * (high_y - low_y)
     for patch in vector.patches:

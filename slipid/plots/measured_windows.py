@@ -48,8 +48,8 @@ class MeasuredWindows:
         amps: measured current [A]; None if currents were not logged.
         amps_model: predicted current [A].
         torque: predicted traction torque at the wheel [N m].
-        drag_torque: predicted torque of the drag along the drive direction, which the motor bears
-            in addition to traction [N m].
+        drag_torque: predicted torque of the drag along the drive direction, against which the motor
+            works in addition to traction [N m].
         unsigned: True if currents were logged as magnitudes.
     """
 
@@ -82,7 +82,7 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
     b, dt = lk.batch(w, robot), w.dt[..., None]
     shape = robot.geometry
     torque = np.asarray(shape.at_drives(as_numbers(curves.wheel_states(robot, b)[1])))
-    amps, drag_torque = (np.asarray(x) for x in _borne(robot, b))
+    amps, drag_torque = (np.asarray(x) for x in _currents_and_drag(robot, b))
     inverse, frame = np.asarray(shape.pseudo_inverse()) * radius, shape.frame()
     encoder = (w.turn @ inverse.T).sum(axis=1)
     length = np.linalg.norm((w.turn @ inverse.T)[..., :2], axis=-1).sum(axis=1)
@@ -156,7 +156,7 @@ def by_heading(
 
 
 @jax.jit
-def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
+def _currents_and_drag(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
     """Return predicted currents [A], and torques of the drag along the drive direction [N m]."""
     motor_force = lk.predict(robot, b).motor_force
     force = robot.surfaces.friction[b.surface] * robot.body.mass * GRAVITY

@@ -46,8 +46,8 @@ def heading_figure(robot: Robot, measured: MeasuredWindows) -> Figure | None:
     made = drawing.figure(
         1.4 + 3.1 * max(len(columns), 2),
         8.2,
-        "Slip depends on the direction of travel, and so does the unwanted turn\n"
-        "dots: camera against encoders; lines: predicted by the force balance",
+        "Slip and unwanted rotation over the direction of travel\n"
+        "dots: camera relative to encoders; lines: predicted by the force balance",
     )
     axes = made.subplots(3, len(columns), sharex=True, sharey="row", squeeze=False)
     speeds = _speeds(measured)
@@ -199,7 +199,7 @@ def _errors(paths: Sequence[_Paths]) -> str:
     error = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / chord[:, None]
     model, encoder = 100 * error.mean(axis=0)
     count = f"{len(paths)} runs" if len(paths) > 1 else "1 run"
-    return f"{count}: end off by {model:.1f} % (encoders {encoder:.1f} %)"
+    return f"{count}: end-point error {model:.1f} % (encoders {encoder:.1f} %)"
 
 
 def _ray(ax: Axes, paths: _Paths) -> None:

@@ -1,4 +1,4 @@
-"""Figures of uncertainty: posterior draws and profile likelihoods beside Gaussian approximations.
+"""Figures of uncertainty: posterior draws and profile likelihoods, and Gaussian approximations.
 
 The Gaussian approximation of the posterior has the curvature of the loss at the fit.
 """
@@ -14,7 +14,7 @@ from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.verdicts.profile import RISE, Profile
 from slipid.plots import drawing
 
-PANELS = 6
+MOST_PANELS = 6
 """Largest number of pairs of parameters that are drawn."""
 
 
@@ -49,7 +49,7 @@ def interval_figure(found: Posterior) -> Figure:
         middle, at + 0.18, xerr=[middle - low, high - middle], fmt=".", color=drawing.BLUE, lw=1.6
     )
     ax.plot([], [], color=drawing.BLUE, lw=1.6, label="draws of the posterior, 90 %")
-    ax.plot([], [], color=drawing.SHADE, lw=1.2, label="curvature at the fit, 90 %")
+    ax.plot([], [], color=drawing.SHADE, lw=1.2, label="Gaussian approximation, 90 %")
     ax.set_yticks(at, [fit.space.names[k] for k in chosen], fontsize=8)
     ax.set_ylim(len(chosen) - 0.4, -0.6)
     ax.set_xlabel("prior standard deviations (logarithm for positive numbers)")
@@ -65,8 +65,8 @@ def pair_figure(found: Posterior) -> Figure:
         len(pairs),
         2.9,
         2.7,
-        "Numbers that trade off along a curved valley: draws (dots)\n"
-        "and the 90 % ellipse of the curvature at the fit",
+        "Numbers that depend on each other along a curve: draws (dots)\n"
+        "and the 90 % ellipse of the Gaussian approximation",
     )
     some = z[:: max(1, len(z) // 1500)]
     for ax, (i, j) in zip(axes, pairs, strict=True):
@@ -99,7 +99,7 @@ def curved_pairs(z: np.ndarray) -> list[tuple[int, int]]:
         i, j = (int(k) for k in np.unravel_index(flat, strength.shape))
         if not {i, j} & {k for pair in found for k in pair}:
             found.append((i, j))
-    return found[:PANELS]
+    return found[:MOST_PANELS]
 
 
 def _ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray) -> None:
@@ -118,17 +118,19 @@ def profile_figure(found: Sequence[Profile]) -> Figure:
         len(found),
         5.4,
         4.4,
-        "Rise of the loss when a number is held elsewhere and all others are refitted",
+        "Rise of the loss if a number is fixed at another value and all others are refitted",
     )
     for ax, profile in zip(axes, found, strict=True):
         _panel(ax, profile)
     axes[0].legend(fontsize=8, loc="upper center")
-    axes[0].set_ylabel("minus log likelihood above its lowest")
+    axes[0].set_ylabel("minus log likelihood above its minimum")
     return made
 
 
 def _panel(ax: Axes, p: Profile) -> None:
-    ax.plot(p.value, p.likelihood, "o-", color=drawing.BLUE, label="data (own prior taken out)")
+    ax.plot(
+        p.value, p.likelihood, "o-", color=drawing.BLUE, label="data (without the number's prior)"
+    )
     ax.plot(p.value, p.posterior, "s--", color=drawing.GREEN, ms=4, label="data and prior")
     ax.plot(p.value, p.laplace, ":", color=drawing.INK, label="Laplace")
     ax.axhline(RISE, color=drawing.SHADE, lw=1)

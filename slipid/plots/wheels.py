@@ -15,7 +15,7 @@ from slipid.plots.measured_windows import MeasuredWindows
 from slipid.plots.motion import named
 
 SIDEWAYS_COLOUR = "#35B779"
-"""Colour of the curve of a wheel whose sideways speed equals its rim speed; dots use it too."""
+"""Colour of the curve of a wheel whose sideways speed equals its rim speed, and of such dots."""
 AT_REST = 0.05
 """Largest ratio of a wheel's speed to that of the fastest wheel at which it counts as at rest."""
 TOO_SLOW = 0.3
@@ -29,7 +29,9 @@ def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
     Dots are the measured slips of all wheels.
     """
     floors = list(dict.fromkeys(floor for floor, _ in measured.groups))
-    title = "A wheel that pushes harder slips more, and more still when it rolls sideways"
+    title = (
+        "Slip increases with the torque of a wheel, and further if the wheel also rolls sideways"
+    )
     made, axes = drawing.panels(len(floors), 3.7, 3.9, title)
     drawn = None
     for ax, floor in zip(axes, floors, strict=True):
@@ -98,7 +100,7 @@ def _curve(ax: Axes, fit: Fit, floor: str) -> None:
     speed, share = curve.wheel_speed, curve.load_share
     slip = np.linspace(0.0, 1.0, 201)
     for sideways, colour, label in (
-        (1.0, SIDEWAYS_COLOUR, "predicted: as fast sideways as ahead"),
+        (1.0, SIDEWAYS_COLOUR, "predicted: sideways as fast as ahead"),
         (0.0, drawing.ORANGE, "predicted: rolls straight, 90 % band"),
     ):
         torque = wheel_curve(fit.robot, floor, slip, sideways, speed, share)

@@ -11,9 +11,9 @@ window k of run r, over the distance d_rk, is
 
     e_rk = a_r d_rk + s_rk,   var a = v_run,   var s_rk = v_process d_rk
 
-with a_r the run's own effect and s_rk process noise. With D_r = sum_k d_rk and
-a^_r = sum_k e_rk / D_r, the two variances are estimated by equating squares within and between runs
-to their expectations:
+with the effect a_r of the run and process noise s_rk. With D_r = sum_k d_rk and a^_r = sum_k e_rk /
+D_r, the two variances are estimated by equating squares within and between runs to their
+expectations:
 
     sum_rk (e_rk - a^_r d_rk)^2 = v_process sum_r (D_r - sum_k d_rk^2 / D_r)
     sum_r (sum_k e_rk)^2        = v_run sum_r D_r^2 + v_process sum_r D_r
@@ -122,7 +122,7 @@ def largest_shift(
 ) -> tuple[str, float]:
     """Return the number, estimated from motion, that shifted most, and its shift [std before].
 
-    Numbers of the camera are excepted. The shift is infinite if the fit with the added runs did not
+    Numbers of the camera are excluded. The shift is infinite if the fit with the added runs did not
     settle. Added runs that agree with the model change a number by less than the standard error it
     had without them (Hausman 1978, Econometrica 46(6)).
     """
@@ -156,17 +156,18 @@ def contradiction(
     if worse:
         reason = f"end-point errors on {worse}"
     elif not np.isfinite(sigma):
-        reason = "the fit to all of them did not settle"
+        reason = "the fit to all of them did not converge"
     elif sigma > LARGEST_SHIFT:
-        reason = f"{name} moves by {sigma:.0f} standard errors"
+        reason = f"{name} changes by {sigma:.0f} standard errors"
     elif as_if[best] < ONE_FLOOR_RATIO * by_map:
         errors = f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} mm/s"
         reason = f"errors of {errors} as if all on {best}"
     else:
         return None
     return (
-        "the runs over several floors were not used: they contradict those on one floor "
-        f"({reason}); their map may be wrong or misplaced, or the contact law where floors meet"
+        "the runs over several floors were not used, since they contradict those on one floor "
+        f"({reason}); the map may be wrong or misplaced, or the contact law is wrong where wheels "
+        "stand on different floors"
     )
 
 

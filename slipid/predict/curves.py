@@ -31,13 +31,12 @@ BOUND_PRECISION = 1e12
 RIDGE = 1e-6
 """Ridge on each coefficient of a monotone curve, relative to the norm of its column.
 
-It has no visible influence where runs determine the coefficients. Where they do not, it selects the
-smallest coefficients; without it, rounding errors would decide.
-"""
+It has no visible influence on coefficients that the runs determine. Of other coefficients it
+selects the smallest values; without it, rounding errors would select them."""
 
 
 def current(signals: RunSignals, spec: RobotSpec) -> Slips:
-    """Return the current of every wheel along its motion [A]; zeros where none was logged."""
+    """Return the current of every wheel along its motion [A]; zeros if none was logged."""
     return np.zeros_like(signals.turn) if signals.current is None else signals.along(spec)
 
 
@@ -54,7 +53,7 @@ def soft_torque(signals: RunSignals, spec: RobotSpec) -> Slips:
 
 @dataclass(frozen=True)
 class WheelSlip(TwistModel, abc.ABC):
-    """A model that predicts the slip of each wheel from its own motor's current."""
+    """A model that predicts the slip of each wheel from the current of its motor."""
 
     @abc.abstractmethod
     def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
@@ -68,20 +67,20 @@ class WheelSlip(TwistModel, abc.ABC):
 @final
 @dataclass(frozen=True)
 class CurveModel(WheelSlip):
-    """Slip of each wheel as a function of its own current or torque, linear in coefficients.
+    """Slip of each wheel as a function of its current or torque, linear in coefficients.
 
         s_i = sum_k beta_k phi_k(x_i)
 
     Attributes:
         features: functions phi_k of the regressor.
         regressor: function that returns x, the current [A] or a torque [N m].
-        per_wheel: True if every wheel has its own coefficients.
+        per_wheel: True if every wheel has separate coefficients.
         monotone: True if only the first coefficient may be negative.
         insensitive: True for an epsilon-insensitive loss instead of least squares, as in support
             vector regression with a linear kernel; epsilon is a tenth of a robust std of the
             displacement lost to slip.
         smoothing: time constant of a low pass of x [s], None for no smoothing.
-        most: largest magnitude of the slip; slip is negative where a wheel is dragged along.
+        most: largest magnitude of the slip; slip is negative if a wheel is dragged along.
     """
 
     features: Features

@@ -1,4 +1,4 @@
-"""Slip models with noise variances of their own, so that they forecast distributions of runs."""
+"""Slip models with estimated noise variances, so that they can forecast distributions of runs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ from slipid.predict.predictive import (
 from slipid.predict.slip_models import FloorModels
 from slipid.search_space import Space
 
-MOST_TURNS, SCORING, SETTLED_CHANGE = 15, 4, 0.02
+MOST_ROUNDS, SCORING_STEPS, SETTLED_CHANGE = 15, 4, 0.02
 """Limits of the fit of variances: largest number of rounds, scoring steps per round, and the change
 of every log variance below which rounds stop.
 
@@ -43,7 +43,7 @@ STEP = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class FittedSlipModel(PredictiveModel):
-    """A fitted slip model with noise variances of its own and the camera of the force balance.
+    """A fitted slip model with its noise variances and the camera of the force balance.
 
     The model's numbers depend on the camera's, so that errors of the camera propagate to them.
 
@@ -108,13 +108,13 @@ def fit_with_noise(
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     own_effects = np.array([c.kind == "run" for c in problem.noise.components])
     objective = replace(problem.objective, scored=problem.objective.scored | own_effects)
-    for _ in range(MOST_TURNS):
+    for _ in range(MOST_ROUNDS):
         last = log_v
         scale = np.asarray(problem.covariance("motion", log_v))
         covariance = _number_covariance(before, common, scale, slope, keep)
         spread = jnp.asarray(parameter_covariance(slope, covariance))
         blocks = {"motion": jnp.asarray(residual)}, {"motion": spread}
-        for _ in range(SCORING):
+        for _ in range(SCORING_STEPS):
             log_v = scoring_step(objective, *blocks, log_v, count, None)
         if float(jnp.abs(log_v - last).max()) < SETTLED_CHANGE:
             break

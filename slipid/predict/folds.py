@@ -1,7 +1,7 @@
 """Cross-validation of every slip model: the folds of runs, and the scores of each fold.
 
-Where headings are held out, all runs of a heading are in the same fold, at every speed and on every
-floor, so that a held-out heading is not fitted anywhere.
+If headings are held out, all runs of a heading are in the same fold, at every speed and on every
+floor, so that a held-out heading is not fitted on any floor.
 """
 
 import time
@@ -112,7 +112,7 @@ def inner_folds(data: Runs, question: str, judged: np.ndarray) -> Fold:
     Args:
         data: all runs.
         question: a key of `QUESTIONS`.
-        judged: indices of the runs that are judged, which the model does not see.
+        judged: indices of the runs that are judged, which are not used for training.
     """
     fold = QUESTIONS[question](fold_keys(data))
     if question != "sectors":
@@ -127,9 +127,9 @@ def inner_folds(data: Runs, question: str, judged: np.ndarray) -> Fold:
 def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
     """Return the fold of every run; -1 for runs that are always fitted and never judged.
 
-    These have no value by which to hold them out, or holding out their fold would leave no run of
-    their floor and load set-up. With `parts`, folds whose numbers have the same remainder modulo
-    `parts` are merged.
+    Such runs lack the property by which runs are held out, or holding out their fold would leave no
+    run of their floor and load set-up. With `parts`, folds whose numbers have the same remainder
+    modulo `parts` are merged.
 
     Raises:
         DataError: no such question.
@@ -161,7 +161,7 @@ class FoldResult:
         seconds: time to `fit` and to `predict` [s], by model.
         numbers: count of fitted numbers, by model and floor.
         converged: True if the fit of the force balance converged.
-        reason: why that fit stopped.
+        reason: reason why that fit stopped.
     """
 
     rows: tuple[ScoredRun, ...]

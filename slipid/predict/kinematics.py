@@ -37,10 +37,10 @@ the sum of far^2, and the constant is not penalised. The weight is chosen in one
 
     - The benchmark selects it from `RIDGES`, as it selects every setting. All load set-ups of a
       floor are pooled.
-    - Otherwise the model selects it from `WEIGHTS` by a cross-validation of its own: over the
-      groups of runs `together`, which optimises the table for the question it is judged by, or over
-      random runs, which optimises it for interpolation. In the comparison a floor has one table for
-      each load set-up it was driven with.
+    - Otherwise the model selects it from `WEIGHTS` by an inner cross-validation: over the groups
+      of runs `together`, which optimises the table for the question by which it is judged, or over
+      random runs, which optimises it for interpolation. In the comparison there is one table for
+      each floor and load set-up.
 
 Liberties:
     - It is not a published system. A table of corrections over the direction of travel is what a
@@ -222,7 +222,7 @@ class _HeadingTable(NamedTuple):
         return np.asarray(weight * np.sum(self.phi[:, 0] ** 2) * np.diag(rough))
 
     def solved(self, weight: float) -> np.ndarray:
-        # of a robot that never moved all features are zero: lstsq then returns zero corrections
+        # If the robot never moved, all features are zero, and lstsq returns zero corrections.
         gram = self.phi.T @ self.phi + self.penalty(weight)
         return np.asarray(np.linalg.lstsq(gram, self.phi.T @ self.gap, rcond=None)[0])
 

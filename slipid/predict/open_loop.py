@@ -1,7 +1,7 @@
 """Open-loop prediction of paths from the first pose, with the uncertainty of their end points.
 
-All poses are in metres as corrected by the fitted camera. Of the measured poses, only the first one
-is used for a prediction.
+All poses are in metres as corrected by the fitted camera. A prediction uses only the first of the
+measured poses.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,10 +23,10 @@ from slipid.model.robot import Robot
 from slipid.predict.slip_model import turned, turned_left
 from slipid.search_space import Space
 
-STEP = 0.5
+LONGEST_STEP_S = 0.5
 """Longest step in which the path of a run is predicted [s]."""
 Numbers = Array | np.ndarray
-TOGETHER = 32
+RUNS_PER_CALL = 32
 """Number of runs that are predicted in one compiled call."""
 
 
@@ -51,13 +51,13 @@ class Tracks:
 
 
 def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
-    """Return the runs, each as one segment of short steps, `TOGETHER` at a time.
+    """Return the runs, each as one segment of short steps, `RUNS_PER_CALL` at a time.
 
     The number of steps of a run is a power of two, so that few shapes are compiled.
     """
     steps = []
     for k, log in enumerate(data.logs):
-        want = 2 ** int(np.ceil(np.log2(max(log.duration / STEP, 16))))
+        want = 2 ** int(np.ceil(np.log2(max(log.duration / LONGEST_STEP_S, 16))))
         frames = int(data.fresh[data.rows(k)].sum())
         while want > 1 and want > frames // 3:
             want //= 2
@@ -66,7 +66,7 @@ def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
 
 
 def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
-    """Return the runs, each as one segment of a given number of steps, `TOGETHER` at a time.
+    """Return the runs, each as one segment of a given number of steps, `RUNS_PER_CALL` at a time.
 
     The last runs of a group are repeated to fill it up, so that few shapes are compiled.
     """
@@ -74,10 +74,10 @@ def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
     out = []
     for count in sorted(set(steps)):
         runs = np.flatnonzero(np.asarray(steps) == count)
-        for first in range(0, len(runs), TOGETHER):
-            some = runs[first : first + TOGETHER]
+        for first in range(0, len(runs), RUNS_PER_CALL):
+            some = runs[first : first + RUNS_PER_CALL]
             w = windows(data.subset(some), radius, lag, per_segment=count, longest=np.inf)
-            filled = np.minimum(np.arange(TOGETHER), len(w) - 1)
+            filled = np.minimum(np.arange(RUNS_PER_CALL), len(w) - 1)
             out.append(replace(w, run=some[w.run]).segments(filled))
     return out
 

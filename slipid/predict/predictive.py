@@ -1,4 +1,4 @@
-"""Predictive distributions of fitted models for runs they were not fitted to.
+"""Predictive distributions of fitted models for runs that were not fitted.
 
 Every model gets a predictive distribution of the same form: a Student t around its prediction, with
 the scale matrix
@@ -59,7 +59,7 @@ Slopes = Float[np.ndarray, "segment m number"]
 
 @dataclass(frozen=True, eq=False)
 class PredictiveModel(abc.ABC):
-    """A fitted model that predicts distributions, with noise variances of its own.
+    """A fitted model with noise variances, which predicts distributions.
 
     Attributes:
         robot: the fitted robot, for its camera and geometry.
@@ -294,7 +294,7 @@ def _fitted_effects(
 
 
 def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
-    """Return J C J^T of every segment, computed without the columns that are zero for it."""
+    """Return J C J^T of every segment, computed without the columns of J that are zero for it."""
     used = (jac != 0.0).any(axis=1)
     patterns, which = np.unique(used, axis=0, return_inverse=True)
     out = np.zeros((len(jac), jac.shape[1], jac.shape[1]))

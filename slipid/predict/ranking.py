@@ -30,12 +30,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SURE_STDS, SMALL_NATS = 2.0, 4.0
-"""Smallest difference of two models that counts: in standard errors, and in nats over all runs.
+"""Smallest relevant difference of two models: in standard errors, and in nats over all runs.
 
 Below four nats in total, models predict equally well and the standard error of their difference is
 unreliable: a model with one superfluous number, for example, loses a little in every run. Source:
-Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
-"""
+Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296."""
 
 
 @dataclass(frozen=True)
@@ -161,12 +160,12 @@ def _band(runs: int, share: float) -> tuple[float, float]:
 def _sentence(floor: str, best: str, models: Mapping[str, RankedModel]) -> str:
     order = sorted((m for m in models if m != best), key=lambda m: -models[m].difference)
     if not order:
-        return f"{floor}: nothing to compare {_name(best)} with"
+        return f"{floor}: no other model to compare with {_name(best)}"
     apart = {m: f"{_name(m)} ({_apart(models[m])})" for m in order}
     tied = [apart.pop(m) for m in order if models[m].verdict == "tied"]
     if tied:
         rest = f"; worse: {next(iter(apart.values()))}" if apart else ""
-        return f"{floor}: the data cannot tell {_name(best)} from {' or '.join(tied)}{rest}"
+        return f"{floor}: the data cannot distinguish {_name(best)} from {' or '.join(tied)}{rest}"
     return (
         f"{floor}: {_name(best)} is best; next {_name(order[0])}, {_apart(models[order[0]])} "
         "nats per run worse"
@@ -219,7 +218,7 @@ def compared(
     """
     fold = folds_of(data, question, parts)
     if (fold < 0).all():
-        raise DataError("no run can be left out; expected several headings or speeds")
+        raise DataError("no run can be held out; expected several headings or speeds")
     rows: list[ScoredRun] = []
     with Reporter(quiet=quiet) as report:
         for k in sorted(set(fold[fold >= 0].tolist())):
@@ -229,7 +228,7 @@ def compared(
 
 
 LEAST_SPEED_RATIO = 0.2
-"""Smallest ratio of a wheel's speed to that of the fastest wheel with which it gives a row."""
+"""A wheel is used in a window only if its speed exceeds this ratio of that of the fastest wheel."""
 VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "all": (LEAST_SPEED_RATIO, False, False),
     "slower wheels too": (0.1, False, False),

@@ -33,7 +33,7 @@ class Score:
             None for a model without regions.
         covered90: True if the level is at most 0.9, None for a model without regions.
         energy_score: energy score [m].
-        log_density: log density of the logged poses [nats], None where it was not computed.
+        log_density: log density of the logged poses [nats], None if it was not computed.
     """
 
     predicted_end: Sequence[float]
@@ -99,8 +99,8 @@ def forecast(
     """Return the level of every measured end point, and its energy score [m].
 
     The level is the probability of the predicted region on whose boundary the end point lies; an
-    end point lies in the 90 % region where the level is at most 0.9. The predictive distribution is
-    a Student t with scale matrix `cov` and `freedom` degrees of freedom. For `cov` None there is no
+    end point lies in the 90 % region if the level is at most 0.9. The predictive distribution is a
+    Student t with scale matrix `cov` and `freedom` degrees of freedom. For `cov` None there is no
     level, and the energy score is the distance itself, as for a point forecast. Source: Gneiting
     and Raftery 2007, JASA 102, eq. 22.
     """
@@ -123,7 +123,7 @@ def forecast(
 def clusters(heading_deg: Sequence[float | None]) -> Int[np.ndarray, " run"]:
     """Return the index of each run's sector of headings.
 
-    A run without a heading is a sector of its own, with a negative index.
+    Every run without a heading is a separate sector, with a negative index.
     """
     return np.array(
         [
@@ -161,6 +161,6 @@ def main_load(loads: Sequence[str]) -> str:
 
 
 def setups(floors: Sequence[str], loads: Sequence[str]) -> list[str]:
-    """Return the floor of each run, `floor@load` where its load set-up is not the main one."""
+    """Return the floor of each run, or `floor@load` if its load set-up is not the main one."""
     main = main_load(loads)
     return [f if load == main else f"{f}@{load}" for f, load in zip(floors, loads, strict=True)]

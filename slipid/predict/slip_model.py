@@ -51,22 +51,21 @@ def setups(w: Windows) -> list[str]:
 
 
 def turned(angle: np.ndarray | float, v: np.ndarray) -> np.ndarray:
-    """Return plane vectors (..., 2), each turned by its angle (...)."""
+    """Return plane vectors (..., 2), each rotated by its angle (...)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
 
 
 def turned_left(v: np.ndarray) -> np.ndarray:
-    """Return plane vectors (..., 2), each turned by a quarter to the left."""
+    """Return plane vectors (..., 2), each rotated by 90 degrees counter-clockwise."""
     return np.stack([-v[..., 1], v[..., 0]], -1)
 
 
 Channel = Literal["current", "gyro", "command", "twist"]
-"""Requirement of a model beside the encoders.
+"""Requirement of a model in addition to the encoders.
 
 `current`, `gyro` and `command` are logged channels; `twist` stands for wheels whose rotations
-determine the body's twist.
-"""
+determine the body's twist."""
 Aim = Literal["end", "energy"]
 """Quantity that a model predicts for a run: its end pose, or its electric energy."""
 Numbers = Float[np.ndarray, " step"]
@@ -77,7 +76,7 @@ TRIES = 4
 WINDOW_S = 0.5
 """Length of the windows on which models are trained and twists are judged [s]."""
 SHAFT_W0 = 3.0
-"""Motor shaft speed w0 below which M = U I / w, infinite at rest, is reduced [rad/s]."""
+"""Motor shaft speed w0 below which M = U I / w, which is infinite at rest, is reduced [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,11 +143,11 @@ class RunSignals:
         name: name of the run.
         dt: length of each step [s].
         turn: rotation of each drive's wheels in the step [rad].
-        current: mean current of each motor [A], signed along its wheel's forward direction where
-            `current_is_signed`, else its magnitude; None where it was not logged.
+        current: mean current of each motor [A], signed along its wheel's forward direction if
+            `current_is_signed`, else its magnitude; None if it was not logged.
         gyro: mean yaw rate from the gyro [rad/s], or None.
         command: commanded twist [m/s, m/s, rad/s], or None.
-        floor: name of the floor; None where a model has to infer it.
+        floor: name of the floor; None if a model has to infer it.
         load: name of the load set-up, which is known to the robot.
     """
 
@@ -175,7 +174,7 @@ class RunSignals:
         return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
     def along(self, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
-        """Return the current along the wheel's motion [A]: positive where the motor drives.
+        """Return the current along the wheel's motion [A]: positive if the motor drives the wheel.
 
         For an unsigned ammeter it is the magnitude, as if the motor always drove.
 
@@ -191,7 +190,7 @@ class RunSignals:
         """Return M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 `rest`.
 
         It is the 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I,
-        made finite at rest by w0. It is positive where the motor drives the wheel.
+        made finite at rest by w0. It is positive if the motor drives the wheel.
         """
         amps, shaft = self.along(spec), np.abs(spec.gear_ratio * self.speed)
         heat = spec.resistance * amps**2 * shaft / (shaft**2 + rest**2)
@@ -227,7 +226,7 @@ class Run:
     """A run with the measured poses of the body, for training and judging models.
 
     Attributes:
-        signals: measurements of the robot; `signals.floor` is None where models do not know it.
+        signals: measurements of the robot; `signals.floor` is None if models do not know the floor.
         pose: x, y [m] and heading [rad] of the body at the edges of the steps, in true metres.
         floor: name of the floor of the run.
         load: name of the load set-up.
@@ -253,7 +252,7 @@ class Run:
         return replace(self, signals=self.signals.windowed(seconds), pose=self.pose[edges])
 
     def with_floor(self, floor: bool) -> "Run":
-        """Return the same run; models know its floor if `floor` is True."""
+        """Return the same run, with or without the name of its floor in `signals`."""
         return replace(self, signals=replace(self.signals, floor=self.floor if floor else None))
 
 
@@ -307,7 +306,7 @@ class SlipModel(abc.ABC):
 
     @abc.abstractmethod
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        """Return predictions of runs the model was not fitted to, from the signals alone."""
+        """Return predictions of runs that were not fitted, from their signals alone."""
 
     @property
     @abc.abstractmethod

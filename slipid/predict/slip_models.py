@@ -137,7 +137,7 @@ def training_windows(w: Windows, robot: Robot) -> TrainingWindows:
     return TrainingWindows(steps_of(w), np.arange(w.dt.size), w.dt.ravel(), twist, run)
 
 
-FEWEST = 5
+LEAST_RUNS = 5
 """Smallest number of runs on a floor, or with a load set-up, to which a model is fitted.
 
 Groups with fewer runs use the fit to all runs.
@@ -188,10 +188,10 @@ def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]
 
 
 def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> list[FloorModels]:
-    """Return slip models from their names and states, as `{model.name: model.state}` wrote them."""
+    """Return slip models from their states by name, as in `{model.name: model.state}`."""
     known = {model.name: model for model in slip_models(shape, has_current=True)}
     if unknown := sorted(set(states) - set(known)):
-        raise ValueError(f"no model '{unknown[0]}'; there are: {', '.join(known)}")
+        raise ValueError(f"no model '{unknown[0]}'; expected one of {', '.join(known)}")
     return [
         known[name].with_state({floor: np.asarray(v, float) for floor, v in state.items()})
         for name, state in states.items()
@@ -200,9 +200,9 @@ def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> l
 
 @dataclass(frozen=True)
 class ByFloor(SlipModel):
-    """A slip model fitted by floor where floors are known, else by load set-up.
+    """A slip model fitted by floor if floors are known, else by load set-up.
 
-    Groups of fewer than `FEWEST` runs use the fit to all runs.
+    Groups of fewer than `LEAST_RUNS` runs use the fit to all runs.
 
     Attributes:
         method: the model, not fitted.
@@ -227,7 +227,7 @@ class ByFloor(SlipModel):
         for run in runs:
             groups.setdefault(self.group_of(run.signals), []).append(run)
         order = sorted(groups, key=lambda name: -len(groups[name]))
-        few = [name for name in order if len(groups[name]) < FEWEST] if len(order) > 1 else []
+        few = [name for name in order if len(groups[name]) < LEAST_RUNS] if len(order) > 1 else []
         fitted = {n: self.method.fit(groups[n], spec) for n in order if n not in few}
         if few:
             fitted |= dict.fromkeys(few, self.method.fit(runs, spec))

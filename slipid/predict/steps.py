@@ -1,4 +1,4 @@
-"""Steps of many runs in common arrays, and slip models that predict a body twist in each step."""
+"""Steps of many runs in common arrays, and slip models that predict the body twist of each step."""
 
 import abc
 from collections.abc import Sequence
@@ -29,8 +29,8 @@ class Steps:
     Attributes:
         signals: all steps as if they were one run; its name and floor are those of the first run.
         first: first step of each run.
-        speed_change: wheel speed at the end of each step less that at its start [rad/s], so that
-            d turn / d lag = -speed_change; None where the lag of the poses is known.
+        speed_change: wheel speed at the end of each step less that at its start [rad/s], so that d
+            turn / d lag = -speed_change; None if the lag of the poses is known.
         lag: assumed lag of the poses behind the wheels [s].
     """
 
@@ -54,7 +54,7 @@ class Steps:
             runs[0],
             dt=np.concatenate([run.dt for run in runs]),
             turn=np.concatenate([run.turn for run in runs]),
-            # a channel that one run lacks is missing for all of them
+            # A channel that is missing in one run is dropped from all of them.
             current=np.concatenate(currents) if len(currents) == len(runs) else None,
             gyro=np.concatenate(gyros) if len(gyros) == len(runs) else None,
             command=None,
@@ -113,7 +113,7 @@ class Steps:
 
 @dataclass(frozen=True, eq=False)
 class TrainingWindows:
-    """Steps of runs, grouped to windows of about half a second, with the measured twist in each.
+    """Steps of runs, grouped into windows of about half a second, with the measured twist in each.
 
     The noise of a camera is large over one step. Models are therefore trained on windows: the mean
     of their predictions over the steps of a window is compared with the measured twist.
@@ -232,7 +232,7 @@ class TwistModel(SlipModel, abc.ABC):
 
     @property
     def known(self) -> np.ndarray:
-        """The fitted numbers.
+        """The fitted numbers as a flat array.
 
         Raises:
             ValueError: the model is not fitted.

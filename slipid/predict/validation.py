@@ -60,7 +60,7 @@ class ScoredRun:
 
 
 def plain_values(values: Iterable[tuple[str, object]]) -> Content:
-    """Return a dict of the values; `session` and `log_density` are omitted where they are None."""
+    """Return a dict of the values; `session` and `log_density` are omitted if they are None."""
     return {k: v for k, v in values if v is not None or k not in ("session", "log_density")}
 
 
@@ -99,8 +99,8 @@ class Validation:
 
     @property
     def which(self) -> str:
-        """Sentence on how many runs are new to the fit."""
-        return f"{self.new} of {len(self.runs)} runs are new to the fit"
+        """Sentence about the number of runs that were not fitted."""
+        return f"{self.new} of {len(self.runs)} runs were not fitted"
 
     def plot(self) -> "Figure":
         """Plot the end-point errors of every model."""
@@ -110,7 +110,7 @@ class Validation:
 
     @property
     def summary(self) -> dict[str, dict[str, FloorSummary]]:
-        """Mean scores by floor and model; another load set-up makes a floor of its own."""
+        """Mean scores by floor and model; another load set-up counts as a separate floor."""
         return {
             name: {m: _mean([run.models[m] for run in runs]) for m in runs[0].models}
             for name, runs in by_floor(self.runs).items()
@@ -132,8 +132,8 @@ def validation(
 
     As in `folds`, every run is predicted as if it were the only run of its session: the session
     effect is unknown and widens the region by its fitted variance, even if other runs of the
-    session were fitted. A run begins at its first pose after the wheels moved 10 mm. `new` is the
-    number of runs that were not fitted.
+    session were fitted. A run begins at its first pose after the wheels have moved by 10 mm. `new`
+    is the number of runs that were not fitted.
 
     Raises:
         DataError: a run on a floor or with a load set-up that was not identified.

@@ -15,7 +15,7 @@ from slipid.support.content import Content
 if TYPE_CHECKING:
     from slipid.deploy.export import Exported
 
-SHOWN = 3
+MOST_SHOWN_GOALS = 3
 """Largest number of goals of a design that have a column in the table of runs."""
 
 
@@ -23,8 +23,8 @@ def show_comparison(page: Page, found: Content) -> None:
     """Write the content of comparison.json: tables with a row per model, and sentences."""
     for question, answer in found["questions"].items():
         page.line(
-            f"{question} left out: log density less the best's ± clustered standard error (nats "
-            "per run), mean end-point error (%), ends in the 90 % region (%)"
+            f"{question} held out: log density less that of the best ± clustered standard error "
+            "(nats per run), mean end-point error (%), end points in the 90 % region (%)"
         )
         page.table(_ranking(answer))
         for one in answer["floors"].values():
@@ -37,16 +37,17 @@ def show_comparison(page: Page, found: Content) -> None:
             ]
             if missed:
                 page.line(
-                    f"  not in {100 * low:.0f} to {100 * high:.0f} %, where honest 90 % regions "
-                    f"hold ends: {', '.join(missed)}"
+                    f"  coverage outside the {100 * low:.0f} to {100 * high:.0f} % expected of "
+                    f"correct 90 % regions: {', '.join(missed)}"
                 )
         page.line()
     if found["surfaces"]:
         one = found["surfaces"]["all"]
         page.line(
-            "slip of a floor that was not fitted, root mean square over floors: one curve of "
-            f"current {one['pooled']['floors']:.3f}, a constant {one['constant']['floors']:.3f}, "
-            f"the floor's own curve {one['per_surface']['floors']:.3f}"
+            "error of slip on a floor that was not fitted, root mean square over floors: one curve "
+            f"of current {one['pooled']['floors']:.3f}, a constant "
+            f"{one['constant']['floors']:.3f}; with a curve fitted to the floor itself "
+            f"{one['per_surface']['floors']:.3f}"
         )
 
 
@@ -59,12 +60,12 @@ def _ranking(answer: Content) -> Table:
         made.add_column(Text(name), justify="right", no_wrap=True)
     made.add_column("fit [s]", justify="right", no_wrap=True)
     for model, spent in answer["cost"].items():
-        cells = [_ranked(one["models"][model]) for one in floors.values()]
+        cells = [_ranking_cell(one["models"][model]) for one in floors.values()]
         made.add_row(model, *cells, _numbers(spent["numbers"]), f"{spent['fit_s']:.1f}")
     return made
 
 
-def _ranked(m: Content) -> str:
+def _ranking_cell(m: Content) -> str:
     """Return a table cell about a model on a floor.
 
     It has the log density less the best model's [nats per run], the end-point error [%] and the
@@ -81,7 +82,7 @@ def _ranked(m: Content) -> str:
 
 
 def _numbers(count: dict[str, int]) -> str:
-    """Return, as text, how many parameters are fitted per floor, and for all floors together."""
+    """Return, as text, the numbers of fitted parameters per floor and for all floors together."""
     floors = sorted({n for floor, n in count.items() if floor != "shared"})
     own = f"{floors[0]}" if len(floors) == 1 else f"{floors[0]}-{floors[-1]}"
     return f"{own} + {count['shared']}" if count["shared"] else own
@@ -91,8 +92,8 @@ def show_design(page: Page, found: Content) -> None:
     """Write the content of design.json: runs to drive next, expected stds, savings over grids."""
     if found["runs"]:
         page.table(_runs(found))
-        rest = len([g for g in found["goals"] if g["reachable"]]) - SHOWN
-        more = f"; {rest} more goals are in design.json" if rest > 0 else ""
+        rest = len([g for g in found["goals"] if g["reachable"]]) - MOST_SHOWN_GOALS
+        more = f"; {rest} further goals are in design.json" if rest > 0 else ""
         page.line(f"std after each run{more}")
     for s in found["runs_saved"].values():
         page.line(_saving(s))
@@ -101,7 +102,7 @@ def show_design(page: Page, found: Content) -> None:
 
 def _runs(found: Content) -> Table:
     """Return the table of proposed runs, with the expected std of each goal after each run."""
-    goals = [g for g in found["goals"] if g["reachable"]][:SHOWN]
+    goals = [g for g in found["goals"] if g["reachable"]][:MOST_SHOWN_GOALS]
     names = ("run", "floor", "load", "heading", "m/s", "turn", "m", "seconds")
     made = table(names, right=[n for n in names if n not in ("floor", "load")])
     for g in goals:
@@ -127,10 +128,10 @@ def _uncertain(std: float, unit: str) -> str:
 
 
 def _saving(s: Content) -> str:
-    """Return a sentence about how many chosen runs are worth as much as a grid of runs."""
+    """Return a sentence about the number of chosen runs with the information of a grid of runs."""
     grid, count = f"{s['name']} ({s['grid_runs']} runs)", s["greedy_runs"]
     if count is None:
-        return f"without earlier data: no fewer chosen runs are worth {grid}"
+        return f"without earlier data: as many chosen runs are needed for the information of {grid}"
     worse = s["criterion_random_order"] / s["criterion"]
     return (
         f"without earlier data: {count} chosen runs are worth {grid}: {s['ratio']:.0%}; the first "
@@ -140,14 +141,16 @@ def _saving(s: Content) -> str:
 
 def show_export(page: Page, done: Exported) -> None:
     """Write the names of the exported files, and warnings about the robot's parameters."""
-    page.line(f"in {done.folder}: README.md, robot.json, {', '.join(f'{x}/' for x in done.forms)}")
+    page.line(
+        f"written to {done.folder}: README.md, robot.json, {', '.join(f'{x}/' for x in done.forms)}"
+    )
     page.notes(done.warnings)
 
 
 def show_trial(page: Page, found: Content, out: Path) -> None:
     """Write a table of every controller's errors, as medians over the starts.
 
-    `out` is the folder of trial.json, which the text names.
+    `out` is the folder of trial.json, to which the text refers.
     """
     errors = ("cross-track", "first side", "heading")
     numbers = ("closure", "of encoders'", "worse", "finished", *errors)
@@ -168,10 +171,12 @@ def show_trial(page: Page, found: Content, out: Path) -> None:
     page.table(made)
     best = found["closes_best"]
     if best is None:
-        page.line(f"not distinguished by these starts: {', '.join(found['not_told_apart'])}")
+        page.line(
+            f"no significant difference with these starts: {', '.join(found['not_told_apart'])}"
+        )
     else:
-        page.line(f"closes best: {best} ({found['controllers'][best]})")
+        page.line(f"smallest closure error: {best} ({found['controllers'][best]})")
     count = min(row["runs"] for row in found["summary"].values())
-    page.line("worse: share of the starts with a larger closure error than encoders")
+    page.line("worse: share of the starts with a larger closure error than that of encoders")
     page.line(f"medians of {count} starts; 90 % intervals and every run: {out / 'trial.json'}")
     page.line(f"look at: {out / 'trial.png'}")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 RECOVERED = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
 """Colours of a self test's verdicts on how a parameter was recovered."""
-OPEN_RATIOS = "\nratios of numbers that the logs may not determine one by one"
+OPEN_RATIOS = "\nratios of numbers that the logs may not determine separately"
 """Title of the table of ratios."""
 
 
@@ -70,13 +70,13 @@ def show_sample(
         page.line(f"converged: worst is {about['reason']}")
     else:
         page.line(
-            f"NOT converged, do not trust the intervals: worst is {about['reason']}; "
-            "a larger --most goes on from here"
+            f"NOT converged, do not trust the intervals: worst is {about['reason']}; run again "
+            "with a larger --most to continue"
         )
 
 
 def show_posterior(page: Page, found: "Posterior") -> None:
-    """Write the parameters of a posterior, and whether its chains have converged."""
+    """Write the parameters of a posterior, and the convergence of its chains."""
     page.table(estimates(found.parameters.values(), f"{found.log_prob.size} draws"))
     state = "converged" if found.converged else "NOT converged, do not trust the intervals"
     page.line(f"{state}: {found.reason}")
@@ -94,7 +94,7 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
 
 
 def show_trust(page: Page, found: "Trust") -> None:
-    """Write the open-loop errors of the fit on its own runs, and whether it can be trusted."""
+    """Write the open-loop errors of the fit on its runs, and the verdict on whether to trust it."""
     if found.floors:
         made = table(("surface", "end / path", "encoders alone"))
         for name, e in found.floors.items():
@@ -113,7 +113,7 @@ def _clocks(clocks: Mapping[str, Content]) -> str:
     offsets = [clock["offset_s"] for clock in clocks.values()]
     wide = [0.5 * (high - low) for low, high in (c["offset_interval90_s"] for c in clocks.values())]
     rate = max((clock["drift"] for clock in clocks.values()), key=abs)
-    question = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate right?"
+    question = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate correct?"
     by = ", ".join(sorted({clock["told_by"] for clock in clocks.values()}))
     return (
         f"clock of the poses, from the motion ({by}): {min(offsets):+.3f} to {max(offsets):+.3f} s "
@@ -134,7 +134,7 @@ def show_check(page: Page, found: Content) -> None:
             Text(row["session"]),
             str(row["runs"]),
             f"{row['seconds'] / 60:.1f}",
-            str(row["headings"] or ""),  # there are 0 without commands, or for turns on the spot
+            str(row["headings"] or ""),  # 0 without commands, or for turns on the spot
             " ".join(f"{v:g}" for v in row["speeds"]),
         )
     page.table(groups)
@@ -144,8 +144,8 @@ def show_check(page: Page, found: Content) -> None:
     for note, count in found["notes"].items():
         page.line(f"repaired in {count} runs: {note}")
     title = (
-        "before any fit: expected information of the logs, for the least informative of the "
-        "floors that a fit starts from"
+        "before a fit: expected information of the logs, for the least informative of the fit's "
+        "start values"
     )
     page.table(_expected(found["parameters"] | found["derived"], title))
     page.notes(found["messages"])
@@ -156,8 +156,8 @@ def _expected(numbers: Mapping[str, Content], title: str) -> Table:
     made = table(("parameter", "unit", "std after / before", "verdict"), title)
     for path, e in numbers.items():
         if e["ratio"] is not None and "session_yaw" not in path:
-            # the ratio of an electric parameter may exceed 1, since the uncertainty of the motion
-            # adds to its prior
+            # The ratio of an electric parameter may exceed 1, since the uncertainty of the motion
+            # is added to that of its prior.
             ratio = f"{min(e['ratio'], 1.0):.3f}"
             made.add_row(Text(path), e["unit"], ratio, verdict(e["verdict"]))
     return made
@@ -214,7 +214,7 @@ class TruthRow:
 
 
 def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
-    """Return true and estimated value of every fitted parameter that truth.json has a truth for."""
+    """Return true and estimated value of every fitted parameter with a true value in truth.json."""
     rows = []
     for e in fit.parameters.values():
         if e.verdict == "fixed" or e.path not in truth:
@@ -244,9 +244,9 @@ def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
         )
     page.table(made)
     page.line(
-        f"{sum(r.inside for r in rows)} of {len(rows)} intervals contain the truth: the logs come "
-        "from another physics (MuJoCo's rollers) than the model's, and intervals include that only "
-        "as far as runs and floors disagree\n"
+        f"{sum(r.inside for r in rows)} of {len(rows)} intervals contain the true value. The logs "
+        "were simulated with other physics (rollers in MuJoCo) than those of the model; "
+        "intervals include this difference only as far as runs and floors disagree\n"
     )
 
 
@@ -270,7 +270,7 @@ def show_selftest(page: Page, found: Content) -> None:
             verdict(e["recovered"], RECOVERED) + (" *" if path in found["wanted"] else ""),
         )
     page.table(numbers)
-    page.line("* wanted; wrong: errors larger than the fits' intervals allow\n")
+    page.line("* wanted; wrong: errors larger than expected from the intervals of the fits\n")
     floors = table(
         ("surface", "slip curve off by", "at most", "in its band", "prediction off by", "encoders")
     )
@@ -293,13 +293,17 @@ def show_selftest(page: Page, found: Content) -> None:
 def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
     """Write the fitted parameters of motors on a bench, warnings, and how the fits ended.
 
-    `taken` has sentences about which columns of the log were used.
+    `taken` has sentences about the columns of the log that were used.
     """
     if taken:
         page.line(f"columns: {'; '.join(taken)}")
     rows = sum(len(r.time) for f in fit.fits for r in f.records)
     motors = f"{len(fit.fits)} motors, " if len(fit.fits) > 1 else ""
-    page.table(estimates(fit.parameters.values(), f"{motors}{rows} rows; everything at the shaft"))
+    page.table(
+        estimates(
+            fit.parameters.values(), f"{motors}{rows} rows; all values refer to the motor shaft"
+        )
+    )
     if fit.derived:
         page.table(estimates(fit.derived.values(), OPEN_RATIOS))
     page.notes(fit.messages)

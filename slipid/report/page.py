@@ -39,7 +39,7 @@ class Page:
         self._console = Console(
             highlight=False, file=file, force_terminal=plain, force_jupyter=plain
         )
-        if not self._console.is_terminal:  # a file or a pipe has no width
+        if not self._console.is_terminal:  # A file or a pipe has no width.
             self._console.width = WIDTH
 
     @property

@@ -1,4 +1,4 @@
-"""An estimator and a controller joined to one pure function, and its runs on a plant."""
+"""Combination of an estimator and a controller as one pure function, and its runs on a plant."""
 
 from dataclasses import dataclass
 from typing import Generic, Protocol, runtime_checkable
@@ -24,8 +24,8 @@ from slipid.robot.trajectory import Path
 
 PERIOD = 0.05
 """Time between two commands [s]."""
-LONGEST = 2.0
-"""Multiple of the path's duration after which, with 10 s added, a run is stopped [1]."""
+DURATION_FACTOR = 2.0
+"""Longest run, as a multiple of the path's duration, to which 10 s are added [1]."""
 
 
 class ControlLoopState(eqx.Module, Generic[State]):
@@ -76,7 +76,7 @@ class ControlLoop(eqx.Module, Generic[State]):
         measurement: Measurement | Readings,
         dt: Float[Numbers, ""] | float,
     ) -> tuple[ControlLoopState[State], ControlLoopOutput]:
-        """Return the next state, and the output: the command and the estimate it is based on."""
+        """Return the next state, and the output: the command and the estimate behind it."""
         dt = jnp.asarray(dt, dtype=float)
         estimator, estimate = self.estimator.step(state.estimator, measurement, dt)
         here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
@@ -88,7 +88,7 @@ class ControlLoop(eqx.Module, Generic[State]):
 
 @runtime_checkable
 class Plant(Protocol):
-    """A robot that takes wheel speeds and returns the readings of its sensors."""
+    """A real or simulated robot: it receives wheel speeds and returns readings of sensors."""
 
     def reset(self) -> Measurement | Readings:
         """Return the first readings, of the robot at rest."""
@@ -100,7 +100,7 @@ class Plant(Protocol):
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """True x, y [m] and heading [rad]; it serves the metrics and no controller reads it."""
+        """True x, y [m] and heading [rad], which are used for metrics only, not by controllers."""
         ...
 
 
@@ -109,13 +109,13 @@ class ClosedLoopRun:
     """A closed-loop run, with one row per control period.
 
     Attributes:
-        path: path that the robot had to follow.
+        path: reference path of the robot.
         time: time of each row [s].
         path_time: time of the path at each row [s].
         pose: true pose [m, m, rad].
         command: commanded wheel speeds [rad/s].
         estimate: outputs of the estimator; every array has a leading axis of steps.
-        energy: energy used by the motors so far [J]; NaN where the plant does not know it.
+        energy: energy used by the motors so far [J]; NaN if the plant does not provide it.
     """
 
     path: Path
@@ -144,14 +144,14 @@ def run_closed_loop(
     Args:
         loop: estimator and controller.
         path: path in world coordinates that begins at `start`.
-        plant: robot that is driven.
+        plant: the robot.
         start: pose at which the estimator starts [m, m, rad].
     """
     wheels = loop.controller.robot.wheels
     state, reading, dt = loop.init(start), plant.reset().filled(wheels), jnp.asarray(PERIOD)
     rows: list[tuple[float, float, tuple[float, float, float], ControlLoopOutput]] = []
     energy, path_time, time = 0.0, 0.0, 0.0
-    gave_up, longest = False, LONGEST * path.duration + 10.0
+    gave_up, longest = False, DURATION_FACTOR * path.duration + 10.0
     while path_time < path.duration - 1e-6 and time < longest and not gave_up:
         state, out = _step(loop, path, state, reading, dt)
         path_time, gave_up = float(out.time), bool(out.gave_up)
@@ -190,15 +190,15 @@ class PathMetrics:
     """Errors of a closed-loop run along its path, computed from true poses.
 
     Attributes:
-        along_track_mm: error along the direction of travel, positive where the robot went too far,
-            at the end of every side or quarter of a curve [mm].
+        along_track_mm: error along the direction of travel at the end of every side or quarter of a
+            curve, positive if the robot went too far [mm].
         sides_mm: straight distance in the path from each of these ends to the next [mm].
         closure_mm: distance from the last pose to the end of the path, plus the path length that
-            remained where the controller gave up [mm].
+            remained if the controller gave up [mm].
         cross_track_rmse_mm: root mean square over time of the distance from the path [mm].
         heading_error_deg: heading error at the end [deg].
         path_length_mm: length of the path driven, the 2021 paper's metric [mm].
-        energy_j: energy used by the motors [J]; None where the plant does not know it.
+        energy_j: energy used by the motors [J]; None if the plant does not provide it.
         effort: root mean square change of the commanded wheel speeds per period [rad/s].
         seconds: duration of the run [s].
         finished: whether the end of the path was reached.

@@ -1,20 +1,19 @@
 """Controllers compute wheel speed commands from a reference pose and an estimate.
 
-All share one interface, `init() -> state` and `step(state, reference, estimate, dt) -> (state,
-wheel speeds)`, one limiter that keeps the direction of motion, and one safe stop. They differ in
-the terms that they add to the pose loop
+All have the same interface, `init() -> state` and `step(state, reference, estimate, dt) -> (state,
+wheel speeds)`, the same limiter, which keeps the direction of motion, and the same safe stop. They
+differ in the terms that they add to the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 
-or in a control law that replaces it.
-
-with the pose p [m] and heading [rad], their references p_ref and heading_ref, the demanded velocity
-v [m/s] in the body frame and yaw rate W [rad/s], and R, the rotation from world to body axes.
+or in a control law that replaces it. Here the pose is p [m] and heading [rad], their references are
+p_ref and heading_ref, v [m/s] is the demanded velocity in the body frame, W [rad/s] the demanded
+yaw rate, and R(-heading) rotates from world to body axes.
 
 A robot whose wheels turn while its body stands still enters recovery: it alternates between turning
-on the spot and driving, with growing effort. A robot far from its path can get stuck like this
-where the demands to drive and to turn cancel at the wheels that have grip and only a wheel without
-grip spins. The controller returns to normal operation once the robot has moved for a while.
+on the spot and driving, with growing effort. A robot far from its path can get stuck in this way if
+the demands to drive and to turn cancel at the wheels with traction, so that only a wheel without
+traction spins. The controller returns to normal operation once the robot has moved for a while.
 Otherwise it stops for good and reports that it gave up.
 """
 
@@ -37,21 +36,21 @@ Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
 """Gain of the 2021 paper's torque correction for each of the robot's three wheels, by the body axis
 along which the robot mainly drives [motor rpm per N m at the motor shaft]."""
-OBSERVE_S = 0.4
+OBSERVER_S = 0.4
 """Time constant of the disturbance observer [s]."""
-LONGEST_I = 0.06
+LARGEST_INTEGRAL = 0.06
 """Largest velocity that the integral term may add to each component [m/s]."""
 STUCK_S = 0.5
-"""Time without the demanded motion after which a robot counts as stuck, and time with the demanded
-motion after which it counts as free again [s]."""
-STUCK_SHARE, STUCK_FROM = 0.2, 0.1
+"""A robot counts as stuck after this time without the demanded motion, and as free again after this
+time with it [s]."""
+STUCK_SHARE, STUCK_LEAST_SPEED = 0.2, 0.1
 """A robot counts as blocked if its speed is below `STUCK_SHARE` times the demanded speed [1], and
-the demanded speed exceeds `STUCK_FROM` [m/s]."""
-TURN_S, GO_S = 0.6, 1.2
-"""Durations of the alternating stages of a recovery: turning on the spot, then driving [s]."""
+the demanded speed exceeds `STUCK_LEAST_SPEED` [m/s]."""
+RECOVERY_TURN_S, RECOVERY_DRIVE_S = 0.6, 1.2
+"""Durations of the alternating phases of a recovery: turning on the spot, then driving [s]."""
 RECOVERY_GROWTH = 0.6
 """Relative growth of the demanded twist per second of recovery [1/s]."""
-GIVES_UP_S = 15.0
+RECOVERY_LIMIT_S = 15.0
 """Duration of a recovery after which the robot stops for good [s]."""
 
 
@@ -63,7 +62,10 @@ class Gains(eqx.Module):
     integral: Array = parameter("1/s^2", "k_i", "pose error's integral", start=0.0)
     observer: Array = parameter("1", "k_d", "disturbance observer", start=0.0)
     preview: Array = parameter(
-        "s", "t_p", "how early rates are asked for, as wheels follow late", start=0.2
+        "s",
+        "t_p",
+        "time by which reference rates are taken ahead, to compensate the delay of the wheels",
+        start=0.2,
     )
 
     @classmethod
@@ -74,7 +76,7 @@ class Gains(eqx.Module):
         without tuned gains for this load set-up, the gains set by hand are returned.
 
         Raises:
-            ValueError: the robot comes without its record.
+            ValueError: the robot has no record.
         """
         known = with_record(robot)
         tuned = known.record.gains
@@ -107,11 +109,11 @@ class ControllerState(eqx.Module):
     Attributes:
         command: last command [rad/s].
         integral: velocity of the integral term [m/s].
-        wanted: twist demanded in the last step [m/s, m/s, rad/s].
+        wanted: twist that was demanded in the last step [m/s, m/s, rad/s].
         miss: smoothed difference, estimated twist less demanded twist [m/s, m/s, rad/s].
         still: time for which the body has not moved as demanded; it counts down while the body
             moves as demanded [s].
-        tried: time since the current recovery began; 0 while there is none [s].
+        tried: time since the current recovery began, 0 if there is none [s].
         begun: whether a command has been computed yet.
     """
 
@@ -126,7 +128,7 @@ class ControllerState(eqx.Module):
     @property
     def gave_up(self) -> Bool[Array, ""]:
         """Whether the controller has stopped for good because the robot is stuck."""
-        return self.tried > GIVES_UP_S
+        return self.tried > RECOVERY_LIMIT_S
 
 
 def limit_command(
@@ -169,14 +171,14 @@ def limit_command(
     return jnp.clip(out, -limits.wheel_speed, limits.wheel_speed)
 
 
-def _turns(tried: Float[Array, ""]) -> Bool[Array, ""]:
+def _spins(tried: Float[Array, ""]) -> Bool[Array, ""]:
     """Return whether a robot turns on the spot after `tried` seconds of recovery."""
-    return (tried > 0) & (jnp.mod(tried, TURN_S + GO_S) < TURN_S)
+    return (tried > 0) & (jnp.mod(tried, RECOVERY_TURN_S + RECOVERY_DRIVE_S) < RECOVERY_TURN_S)
 
 
 def _recovery_factors(tried: Float[Array, ""]) -> Float[Array, "3"]:
     """Return the factors on the demanded twist after `tried` seconds of recovery."""
-    one = jnp.where(_turns(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
+    one = jnp.where(_spins(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
     return jnp.where(tried > 0, one * (1 + RECOVERY_GROWTH * tried), 1.0)
 
 
@@ -188,8 +190,9 @@ class Controller(eqx.Module):
         gains: gains; by default those tuned for the robot if they are better than those set by
             hand.
         limits: limits of the command.
-        correction: torque correction of the 2021 paper: "paper_print" as the paper prints it,
-            "paper_code" as its authors ran it, "torque" with the errors removed, or "none".
+        correction: torque correction of the 2021 paper: "paper_print" as printed in the paper,
+            "paper_code" as in the authors' program, "torque" with their errors corrected, or
+            "none".
         law: control law that replaces the pose loop and its integral; if it is an equinox module,
             its numbers are arguments of the compiled code.
     """
@@ -214,7 +217,7 @@ class Controller(eqx.Module):
 
     @eqx.filter_jit
     def init(self) -> ControllerState:
-        """Return the state of a controller that has commanded nothing yet."""
+        """Return the state of a controller before its first command."""
         none, still, zero = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros(())
         return ControllerState(none, jnp.zeros(2), still, still, zero, zero, jnp.zeros((), bool))
 
@@ -246,10 +249,10 @@ class Controller(eqx.Module):
         gap = ref[:2] - pose[:2]
         safe &= ~old.gave_up
         still, tried = self._recovery(old, e, jnp.where(safe, dt, 0.0))
-        wanted = self._wanted(old, ref, pose, gap)
-        # disturbance: estimated twist of the robot, less the twist demanded in the last step
+        wanted = self._demanded_twist(old, ref, pose, gap)
+        # The disturbance is the estimated twist less the twist demanded in the last step.
         twist = jnp.where(safe, e.twist, 0.0)
-        a = 1 - jnp.exp(-dt / OBSERVE_S)
+        a = 1 - jnp.exp(-dt / OBSERVER_S)
         miss = old.miss + a * (twist - old.wanted - old.miss)
         demand = wanted - k.observer * miss
         wheels = self.robot.forward @ demand / self.robot.frame.radius + self._torque(wanted, e)
@@ -257,8 +260,10 @@ class Controller(eqx.Module):
         wheels = jnp.where(safe, wheels, 0.0)
         since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
         command = limit_command(wheels, before, e.current, self.robot, self.limits, since)
-        free = safe & (jnp.max(jnp.abs(command - wheels)) < 0.05)  # no integration at a limit
-        summed = jnp.clip(old.integral + k.integral * gap * dt, -LONGEST_I, LONGEST_I)
+        free = safe & (
+            jnp.max(jnp.abs(command - wheels)) < 0.05
+        )  # The integral is frozen while a limit is active.
+        summed = jnp.clip(old.integral + k.integral * gap * dt, -LARGEST_INTEGRAL, LARGEST_INTEGRAL)
         new = ControllerState(
             command=command,
             integral=jnp.where(free, summed, jnp.where(safe, old.integral, 0.0)),
@@ -274,18 +279,18 @@ class Controller(eqx.Module):
         """Return the time without the demanded motion, and the time since recovery began [s].
 
         While the robot turns on the spot no translation is demanded, so the first time does not
-        change during that stage.
+        change during that phase.
         """
         demand = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
         speed = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
-        blocked = e.immobilised | ((demand > STUCK_FROM) & (speed < STUCK_SHARE * demand))
-        since = jnp.where(_turns(old.tried), 0.0, jnp.where(blocked, dt, -dt))
+        blocked = e.immobilised | ((demand > STUCK_LEAST_SPEED) & (speed < STUCK_SHARE * demand))
+        since = jnp.where(_spins(old.tried), 0.0, jnp.where(blocked, dt, -dt))
         still = jnp.clip(old.still + since, 0.0, 2 * STUCK_S)
         tries = still > STUCK_S
         still = jnp.where(tries & (old.tried == 0), 2 * STUCK_S, still)
         return still, jnp.where(tries, old.tried + dt, 0.0)
 
-    def _wanted(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
+    def _demanded_twist(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
         """Return the twist that the pose loop or the law demands, within the speed limit.
 
         Units are [m/s, m/s, rad/s].
@@ -321,7 +326,7 @@ class Controller(eqx.Module):
             off = force.at[:2].add(-(force[:2] @ u) * u).at[2].multiply(straight)
         if self.correction == "torque":
             moment = f.frame.radius * f.inverse.T @ off
-        else:  # as the paper prints it: divided by the lever arm instead of multiplied
+        else:  # as printed in the paper: divided by the lever arm instead of multiplied
             printed = f.forward.at[:, 2].divide(f.frame.base**2)
             moment = f.frame.radius * printed @ off
         moves = jnp.max(jnp.abs(e.wheel_speed)) > 0.5

@@ -1,4 +1,4 @@
-"""Arrays of an identified robot that estimators and controllers use; they come from robot.json."""
+"""Arrays of an identified robot from robot.json, as used by estimators and controllers."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -24,10 +24,10 @@ from slipid.support.errors import DataError
 
 
 class RobotArrays(Drives):
-    """Arrays of an identified robot with one load set-up, as estimators and controllers hold them.
+    """Arrays of an identified robot with one load set-up, for estimators and controllers.
 
     Compiled code depends only on the static fields, which describe the robot's structure, so robots
-    of equal structure share it whatever their numbers. A drive is a motor with its encoder and
+    of equal structure share it, with any parameters. A drive is a motor with its encoder and
     ammeter. There is one for every wheel unless a motor drives several wheels.
 
     Attributes:
@@ -87,7 +87,7 @@ class RobotArrays(Drives):
 
     @property
     def by_wheels(self) -> Float[Array, "3 wheel"]:
-        """Matrix from rim speeds to body twist, where wheels of a drive share their speed."""
+        """Matrix from rim speeds of wheels to body twist, for equal speeds of wheels of a drive."""
         if not self.drive_of:
             return self.inverse
         return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
@@ -106,7 +106,7 @@ class DeployedRobot(RobotArrays):
     """An identified robot ready for deployment: the content of robot.json for one load set-up.
 
     Attributes:
-        record: every number with its interval, verdict and provenance.
+        record: every parameter with its interval, verdict and provenance.
         load_setup: name of the load set-up.
     """
 
@@ -117,8 +117,8 @@ class DeployedRobot(RobotArrays):
     def steers(self) -> bool:
         """Whether its wheels can produce any twist, each of them driven alone.
 
-        A robot that does not steer has an estimator but no controller, since
-        `slipid.robot.controller` demands sideways motion as well.
+        Other robots have an estimator but no controller, since `slipid.robot.controller` also
+        demands sideways motion.
         """
         shape = geometry_of(self.record)
         return not shape.drive_of and shape.determines_twist
@@ -128,7 +128,7 @@ class DeployedRobot(RobotArrays):
         """Return the robot of a record with a load set-up, the first one by default.
 
         Raises:
-            ValueError: there is no such load set-up, or a number is missing or out of its bounds.
+            ValueError: there is no such load set-up, or a parameter is missing or out of bounds.
         """
         check_record(record)
         return _arrays(record, load, {path: n.value for path, n in record.parameters.items()})
@@ -157,20 +157,20 @@ class DeployedRobot(RobotArrays):
         """Write robot.json, with all load set-ups.
 
         Raises:
-            ValueError: arrays differ from those of the record, since they were changed later; the
-                file can hold only the record.
+            ValueError: the arrays differ from those of the record because they were changed; only
+                the record can be stored in a file.
             DataError: the file cannot be written.
         """
         same = DeployedRobot.of(self.record, self.load_setup)
         pairs = zip(jax.tree.leaves(self), jax.tree.leaves(same), strict=True)
         if not all(np.array_equal(a, b) for a, b in pairs):
             raise ValueError(
-                "arrays of this robot are not those of its record, so a file cannot hold them"
+                "the arrays of this robot differ from its record and cannot be stored in a file"
             )
         write_robot(Path(path), self.record)
 
     def on(self, *floors: str) -> "DeployedRobot":
-        """Return the robot for a site that is known to have these floors only.
+        """Return the robot for a site on which only these floors occur.
 
         Raises:
             ValueError: no floor is given, one is given twice or is not identified; the message
@@ -181,7 +181,7 @@ class DeployedRobot(RobotArrays):
             if name not in self.labels:
                 raise ValueError(f"no floor '{name}'; identified: {known}")
         if len(set(floors)) < max(len(floors), 1):
-            raise ValueError(f"floors {list(floors)}; expected each once of {known}")
+            raise ValueError(f"floors {list(floors)}; expected different names out of {known}")
         rows = tuple(self.labels.index(name) for name in floors)
         return DeployedRobot.of(self.record.on(rows), self.load_setup)
 
@@ -203,8 +203,8 @@ def with_record(robot: RobotArrays) -> DeployedRobot:
     """
     if not isinstance(robot, DeployedRobot):
         raise ValueError(
-            "arrays of a robot without its record; expected a DeployedRobot, or settings and gains "
-            "to go with the arrays"
+            "the arrays of a robot without its record; expected a DeployedRobot, or settings and "
+            "gains in addition to the arrays"
         )
     return robot
 

@@ -5,8 +5,8 @@ into a body motion, from which a second filter computes the pose (`pose_filter`)
 
     xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late corrections from the floors)
 
-with p_c the probability of hypothesis c, one floor under each wheel, and xi_c the body twist
-[m/s, m/s, rad/s] if that hypothesis is true.
+with p_c the probability of hypothesis c (a floor for each wheel), and xi_c the body twist [m/s,
+m/s, rad/s] if that hypothesis is true.
 """
 
 from dataclasses import replace
@@ -33,7 +33,7 @@ from slipid.robot.interface import (
     as_arrays,
 )
 
-CURRENT_FROM = 0.4
+SLIP_CURRENT = 0.4
 """Motor current above which the 2021 paper's deployed estimator subtracts slip [A]."""
 
 
@@ -80,10 +80,10 @@ class Estimator(AbstractEstimator[EstimatorState]):
         self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
     ) -> EstimatorState:
         """Return the state of a robot at rest at a pose [m, m, rad] with stds [m], [rad]."""
-        return self._begun(as_numbers(pose), as_numbers(std))
+        return self._state_at(as_numbers(pose), as_numbers(std))
 
     @eqx.filter_jit
-    def _begun(self, pose: Float[Array, "3"], std: Float[Array, "2"]) -> EstimatorState:
+    def _state_at(self, pose: Float[Array, "3"], std: Float[Array, "2"]) -> EstimatorState:
         f, s = self.robot, self.settings
         return EstimatorState(
             wheels=WheelState.init(f, s),
@@ -165,7 +165,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
 
 
 def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Array) -> FloorState:
-    """Return the belief after a map corrected the pose.
+    """Return the belief over hypotheses after a map has corrected the pose.
 
     Args:
         floors: belief before the correction.
@@ -198,7 +198,7 @@ class Odometry(AbstractEstimator[OdometryState]):
         robot: identified robot.
         settings: settings; by default those for the sensors and floors of the robot's logs.
         curve: True for a slip ratio by `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
-            current I [A] exceeds `CURRENT_FROM`, as on the 2021 paper's robot; False for no slip.
+            current I [A] exceeds `SLIP_CURRENT`, as on the 2021 paper's robot; False for no slip.
     """
 
     robot: RobotArrays
@@ -211,10 +211,10 @@ class Odometry(AbstractEstimator[OdometryState]):
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> OdometryState:
         """Return the state of a robot at rest at a pose [m, m, rad]."""
-        return self._begun(as_numbers(pose))
+        return self._state_at(as_numbers(pose))
 
     @eqx.filter_jit
-    def _begun(self, pose: Float[Array, "3"]) -> OdometryState:
+    def _state_at(self, pose: Float[Array, "3"]) -> OdometryState:
         return OdometryState(
             pose=pose,
             wheels=WheelState.init(self.robot, self.settings),
@@ -230,13 +230,15 @@ class Odometry(AbstractEstimator[OdometryState]):
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
         known = jnp.isfinite(z.current) & (jnp.abs(z.current) < 10.0 * f.highest[1])
-        a = 1 - jnp.exp(-dt / 0.6)  # 0.6 s: the paper's robot kept 0.97 of the value per row
+        a = 1 - jnp.exp(
+            -dt / 0.6
+        )  # 0.6 s, since the filter of the paper's robot had a factor of 0.97 per row
         smoothed = old.current + a * (jnp.abs(z.current) - old.current)
         amps = jnp.where(known, smoothed, old.current)
         slip = jnp.zeros_like(w)
         if self.curve:
             line = f.wheel_curve[:, 0] + f.wheel_curve[:, 1] * amps
-            slip = jnp.where(amps > CURRENT_FROM, jnp.clip(line, 0.0, 0.95), 0.0)
+            slip = jnp.where(amps > SLIP_CURRENT, jnp.clip(line, 0.0, 0.95), 0.0)
         twist = f.inverse @ (f.frame.radius * w * (1 - slip))
         pose = compose(old.pose, advance(twist, dt))
         unknown = jnp.zeros((f.wheels, len(f.labels) + 1)).at[:, -1].set(1.0)

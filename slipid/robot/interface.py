@@ -21,9 +21,10 @@ NO_FLOOR = "unknown"
 """Name used for the floor under a wheel if no identified floor explains the measurements."""
 MIXED_FLOORS_PENALTY = 1.0
 """Value of `Settings.further_floor_penalty` for a robot that is known to drive across edges between
-floors: drop in log probability for each further floor [1]."""
+floors: decrease of the log probability for each further floor [1]."""
 UNTIMED_S = 0.01
-"""Duration assumed for a step without a valid time step, to age readings and to stop [s]."""
+"""Duration that is assumed for a step without a valid time step, for the age of readings and for
+stopping [s]."""
 State = TypeVar("State", bound=eqx.Module)
 Some = TypeVar("Some", bound=eqx.Module)
 Scalar = Float[Array, ""] | float
@@ -35,16 +36,17 @@ def as_arrays(given: Some) -> Some:
 
 
 class Settings(eqx.Module):
-    """Settings of an estimator; they are chosen, not identified.
+    """Settings of an estimator, which are chosen and not identified.
 
     Attributes:
         current_is_signed: whether the ammeters measure the sign of a current.
-        forget_s: time over which measurements count as one independent piece of evidence on the
+        forget_s: measurements within this time count as one independent piece of evidence about the
             floors [s].
         filter_s: time constant of the filter of currents [s].
         patch_m: mean path length between changes of the floor under a wheel [m].
         doubt_m: distance over which an error of the belief about floors persists [m].
-        further_floor_penalty: drop in log probability for each further floor under the robot [1].
+        further_floor_penalty: decrease of the log probability of a hypothesis for each further
+            floor under the robot [1].
         unknown_std: weighted residual above which "unknown" is more likely than a hypothesis [1].
         ammeter_std_a: noise of an ammeter [A].
         voltmeter_std_v: noise of a voltmeter [V].
@@ -52,7 +54,7 @@ class Settings(eqx.Module):
         gyro_bias_std: std of a gyro's bias at the start [rad/s].
         gyro_delay_s: age of a gyro's readings [s].
         still_m_s: rim speed below which the robot counts as at rest [m/s].
-        stale_s: time without readings of a wheel after which it is stale [s].
+        stale_s: a wheel is stale after this time without readings [s].
         longest_s: longest time step for which motion is predicted [s].
     """
 
@@ -74,7 +76,7 @@ class Settings(eqx.Module):
 
     @classmethod
     def of(cls, robot: RobotArrays) -> "Settings":
-        """Return the settings for a robot that has the sensors and floors of its own logs.
+        """Return the settings for a robot with the sensors and floors of its logs.
 
         Raises:
             ValueError: the robot comes without its record.
@@ -86,9 +88,9 @@ class Settings(eqx.Module):
 
 
 class Readings(eqx.Module):
-    """A measurement with NaN for everything that is absent; attributes as in `Measurement`.
+    """A measurement with NaN for all absent readings; attributes as in `Measurement`.
 
-    All robots with the same number of drives share one structure, whichever sensors they have.
+    Robots with the same number of drives have the same structure, regardless of their sensors.
     """
 
     wheel_angle: Float[Array, "*batch drive"]
@@ -103,25 +105,25 @@ class Readings(eqx.Module):
     @classmethod
     @eqx.filter_jit
     def nothing(cls, drives: int) -> "Readings":
-        """Return the readings of a robot with this number of drives that measures nothing."""
+        """Return the readings of a robot with this number of drives and no sensors."""
         shapes = [(drives,)] * 4 + [(), (3,), (2,), ()]
         return cls(*(jnp.full(shape, jnp.nan, dtype=float) for shape in shapes))
 
     def filled(self, drives: int) -> "Readings":
-        """Return these readings, which have no gaps to fill."""
+        """Return these readings, in which no field is missing."""
         return self
 
 
 class Measurement(eqx.Module):
-    """Readings of the sensors in one step; None or NaN where there is none.
+    """Readings of the sensors in one step; None or NaN if there is no reading.
 
-    `Measurement(wheel_angle=angle, current=amps)` is a robot that measures these two.
+    Example: `Measurement(wheel_angle=angle, current=amps)` for a robot that measures these two.
 
     Attributes:
         wheel_angle: cumulative angle of every encoder, scaled to turns of the wheel [rad]; it takes
             precedence over `wheel_speed`.
         wheel_speed: rate of change of that angle [rad/s].
-        current: current of every motor [A], signed or unsigned as the estimator's settings say.
+        current: current of every motor [A], with or without sign according to the settings.
         voltage: voltage of every motor [V].
         gyro: yaw rate [rad/s].
         fix: pose from another source such as a camera: x, y [m], heading [rad].
@@ -140,7 +142,7 @@ class Measurement(eqx.Module):
     fix_age: Given = None
 
     def filled(self, drives: int) -> Readings:
-        """Return the same readings with NaN for everything that is absent.
+        """Return the same readings with NaN for all absent ones.
 
         Raises:
             ValueError: a field does not have the shape for this number of drives.
@@ -161,12 +163,12 @@ class StateEstimate(eqx.Module):
 
     Attributes:
         pose: x, y [m], heading [rad].
-        twist: velocity of the body in its own axes [m/s, m/s, rad/s].
+        twist: velocity of the body in body axes [m/s, m/s, rad/s].
         slip: slip ratio of the wheels of each drive [1].
         wheel_speed: speed of the wheels of each drive [rad/s].
         current: signed, filtered current of each motor [A].
-        surface_probability: probability of each floor under each wheel, in the order of `labels`,
-            and of none of them in the last column [1].
+        surface_probability: probability of each floor under each wheel, in the order of `labels`;
+            the last column is the probability that it is none of them [1].
         covariance: covariance of the pose in the world frame, in products of [m, m, rad].
         stale: whether readings of a wheel are missing for too long.
         immobilised: whether the wheels turn while the body stands still.
@@ -214,7 +216,7 @@ class AbstractEstimator(eqx.Module, Generic[State]):
     def advance(
         self, state: State, z: Readings, dt: Float[Array, ""]
     ) -> tuple[State, StateEstimate]:
-        """Return what `step` returns, from readings that have every field; `dt` is in [s]."""
+        """Return the result of `step`, given readings with all fields; `dt` is in [s]."""
 
     def step(
         self, state: State, measurement: Measurement | Readings, dt: Float[Numbers, ""] | float
@@ -222,8 +224,8 @@ class AbstractEstimator(eqx.Module, Generic[State]):
         """Return state and estimate one time step later.
 
         The step is compiled at its first call; inside a function that JAX transforms it becomes
-        part of that function. Readings that are None, not finite, or beyond what a sensor of this
-        robot could measure count as not measured; a `dt` [s] that is not a positive number counts
+        part of that function. Readings that are None, not finite, or outside the range of the
+        robot's sensors are treated as missing; a `dt` [s] that is not a positive number is treated
         as 0.
         """
         z, dt = measurement.filled(self.robot.drives), jnp.asarray(dt, dtype=float)

@@ -1,6 +1,6 @@
-"""An identified robot as plain values: every number with its uncertainty and its origin.
+"""An identified robot as plain values: every parameter with its uncertainty and its origin.
 
-Field names are the keys of robot.json. Units of fields are listed in `UNITS`; each number in
+Field names are the keys of robot.json. Units of fields are listed in `UNITS`; each parameter in
 `RobotRecord.parameters` has its own field `unit`.
 """
 
@@ -60,12 +60,12 @@ class RecordedNumber:
     Attributes:
         value: value [unit].
         unit: unit of the value.
-        std: posterior std [unit]; None where the number was fixed.
-        interval90: equal-tailed 90 % interval [unit]; None where the number was fixed.
-        verdict: how well the logs determine it.
-        provenance: what determines the value: the logs ("measured"), a prior ("borrowed") or an
-            explicit choice ("override").
-        source: method that std and interval come from.
+        std: posterior std [unit]; None for a fixed parameter.
+        interval90: equal-tailed 90 % interval [unit]; None for a fixed parameter.
+        verdict: verdict on how well the logs determine the value.
+        provenance: source of the value: "measured" (the logs), "borrowed" (a prior) or "override"
+            (an explicit choice).
+        source: method by which std and interval were computed.
     """
 
     value: Numbers
@@ -109,8 +109,8 @@ class FloorRecord:
         process: std of errors that grow with the root of the path length.
         effect: std of effects, errors that stay the same over the path.
         current_std: std of measured less modelled currents, without the ammeters' noise.
-        seen: ranges of speed, torque and so on that the fitted runs cover; None where the numbers
-            were given, not fitted.
+        seen: ranges of speed, torque and so on that the fitted runs cover; None if the numbers were
+            given, not fitted.
         unseen: True for a floor that no run drove on, see `slipid.robot.unseen`.
     """
 
@@ -132,7 +132,7 @@ class EffectRecord:
     Attributes:
         speeds: speeds of the rows, rising.
         mean: estimated effect, to be added to the motion that the model predicts.
-        left: remaining std, which includes the uncertainty of the robot's numbers.
+        left: remaining std, which includes the uncertainty of the robot's parameters.
     """
 
     speeds: tuple[float, ...]
@@ -147,7 +147,7 @@ class LoadRecord:
     Attributes:
         name: name of the load set-up.
         spread: std of the motion per metre on every floor due to the parameters' uncertainty.
-        told: effect table; None if the robot was not fitted to runs.
+        told: effect table of this load set-up; None if the robot was not fitted to runs.
         highest_current: largest current that the model predicts up to 0.8 of the highest wheel
             speed.
         wheel_curve: a and b of a + b |I|, the slip ratio of each drive over all floors.
@@ -224,7 +224,7 @@ class GainsRecord:
 
     Attributes:
         values: the gains.
-        load: load set-up they were tuned for.
+        load: load set-up for which they were tuned.
         gyro: whether the robot had a gyro.
         method: method of the search.
         loss: losses of the gains set by hand and of the tuned gains.
@@ -253,7 +253,7 @@ class RobotRecord:
     """Content of robot.json. Two records with the same content are equal.
 
     Attributes:
-        source: method that the numbers come from.
+        source: method that the parameters come from.
         wheels: shape of the robot.
         parameters: numbers of the robot by path, such as `robot.mass`.
         floors: floors in the order of the arrays.
@@ -261,13 +261,13 @@ class RobotRecord:
         current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v.
         highest_speed: highest wheel speed of the fitted runs.
         sensors: sensors of the logs.
-        alike: drop in log probability for each further floor under the robot; lower where the fit
-            used runs over several floors.
-        messages: messages for readers of the numbers.
-        data: hash of the runs; None where the numbers were given.
-        versions: versions of the software that computed them.
-        draws: posterior draws of the fitted numbers, by path.
-        gains: tuned gains; None where there are none.
+        alike: decrease of the log probability for each further floor under the robot; it is smaller
+            if the fit used runs over several floors.
+        messages: messages for users of the parameters.
+        data: hash of the runs; None if the parameters were given, not fitted.
+        versions: versions of the software that computed the numbers.
+        draws: posterior draws of the fitted parameters, keyed by path.
+        gains: tuned gains; None if there are none.
     """
 
     source: Source = "given"
@@ -287,7 +287,7 @@ class RobotRecord:
 
     @cached_property
     def numbers(self) -> str:
-        """Hash of the robot's numbers; it does not depend on gains, versions and messages."""
+        """Hash of the robot's parameters; it does not depend on gains, versions and messages."""
         return checksum(asdict(replace(self, gains=None, versions={}, messages=())))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Reading and writing of robot.json: a write is complete or changes nothing, errors are explained.
+"""Reading and writing of robot.json; a failed write leaves the old file unchanged.
 
 `typed` turns JSON values into dataclasses. `robot.schema.json` in this folder describes the
 file for other programs.
@@ -36,7 +36,7 @@ def typed(kind: Any, value: object, where: str = "") -> Any:
     Args:
         kind: a dataclass, or the type of one of its fields: bool, int, float, str, None, a
             `Literal`, a tuple, a mapping by str, a union or a dataclass.
-        value: value as `json.loads` returns it.
+        value: value returned by `json.loads`.
         where: position of the value in the file, such as `floors[0].name`, for messages.
 
     Raises:
@@ -110,11 +110,11 @@ def _wrong(where: str, value: object, expected: str) -> ValueError:
 
 
 SCHEMA = "slipid.robot/6"
-REWRITE_HINT = "copy it again, or write it anew with `slipid identify`"
+REWRITE_HINT = "copy it again, or write it again with `slipid identify`"
 
 
 def write_robot(path: Path, record: RobotRecord) -> None:
-    """Write a robot's file; raise `DataError` where it cannot be written."""
+    """Write a robot's file; raise `DataError` if it cannot be written."""
     write_bytes(path, robot_bytes(record))
 
 
@@ -132,7 +132,7 @@ def read_robot(path: Path) -> RobotRecord:
     written, computed = content.pop("checksum", None), checksum(content)
     content.pop("schema")
     if content.pop("units", None) != UNITS:
-        raise DataError(f"{path}: other units than {SCHEMA} has; {REWRITE_HINT}")
+        raise DataError(f"{path}: its units differ from those of {SCHEMA}; {REWRITE_HINT}")
     numbers = content.pop("numbers", None)
     try:
         record: RobotRecord = typed(RobotRecord, content)
@@ -155,13 +155,13 @@ def _content(path: Path) -> dict[str, object]:
         )
     except OSError as error:
         reason = error.strerror or str(error)
-        raise DataError(f"{path}: {reason}; expected what `slipid identify` writes") from error
+        raise DataError(f"{path}: {reason}; expected a robot.json of `slipid identify`") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: no valid JSON ({error}); {REWRITE_HINT}") from error
+        raise DataError(f"{path}: not valid JSON ({error}); {REWRITE_HINT}") from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if not (isinstance(schema, str) and re.fullmatch(r"slipid\.robot/[1-9][0-9]{0,8}", schema)):
         raise DataError(
-            f"{path}: no robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
+            f"{path}: not a robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
             "that `slipid identify` writes"
         )
     if schema != SCHEMA:
@@ -196,9 +196,9 @@ def _text(value: object, indent: str = "") -> str:
 
 
 def check_record(record: RobotRecord) -> None:
-    """Raise `ValueError` if parts of a record do not fit together.
+    """Raise `ValueError` if parts of a record contradict each other.
 
-    The message names the field and what is expected.
+    The message gives the field and the expected content.
     """
     wheels = len(record.wheels.place)
     if not wheels:
@@ -208,7 +208,9 @@ def check_record(record: RobotRecord) -> None:
     drives = geometry_of(record).drives  # raises for wheels that cannot drive, or without a drive
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):
-            raise ValueError(f"{kind} {list(names)}; expected one or more, each once")
+            raise ValueError(
+                f"{kind} {list(names)}; expected at least one name, and each only once"
+            )
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
         _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, drives)
@@ -226,10 +228,12 @@ def geometry_of(record: RobotRecord) -> Geometry:
 
 
 def _check_effects(where: str, table: EffectRecord, floors: int) -> None:
-    """Raise `ValueError` for an effect table whose speeds do not rise or whose rows do not fit."""
+    """Raise `ValueError` for an effect table with unsorted speeds or with missing rows."""
     speeds = table.speeds
     if not speeds or speeds[0] <= 0 or any(a >= b for a, b in pairwise(speeds)):
-        raise ValueError(f"{where}.speeds: {list(speeds)}; expected positive ones that rise")
+        raise ValueError(
+            f"{where}.speeds: {list(speeds)}; expected positive speeds in rising order"
+        )
     around = len(table.mean[0][0]) if table.mean and table.mean[0] else 0
     for name, by_floor in (("mean", table.mean), ("left", table.left)):
         _counted(f"{where}.{name}", by_floor, floors)
@@ -254,7 +258,7 @@ def _numbers(record: RobotRecord) -> None:
             raise ValueError(f"parameters['{path}'] is missing")
     for path in (*record.parameters, *record.draws):
         if path not in known:
-            raise ValueError(f"'{path}': no such number of a robot with these floors and loads")
+            raise ValueError(f"'{path}': not a parameter of a robot with these floors and loads")
     for path, number in record.parameters.items():
         (declaration, size), where = known[path], f"parameters['{path}']"
         _inside(f"{where}.value", number.value, declaration, size)
@@ -266,7 +270,9 @@ def _numbers(record: RobotRecord) -> None:
             raise ValueError(f"{where}.interval90: expected {size} intervals")
     counts = {len(rows) for rows in record.draws.values()}
     if len(counts) > 1 or 0 in counts:
-        raise ValueError(f"draws: {sorted(counts)} of different numbers; expected as many of each")
+        raise ValueError(
+            f"draws: {sorted(counts)} draws of different parameters; expected equally many of each"
+        )
     for path, rows in record.draws.items():
         for k, row in enumerate(rows):
             _inside(f"draws['{path}'][{k}]", row, *known[path])

@@ -1,4 +1,4 @@
-"""Paths over time: reference poses and rates, and the rule by which a path waits for its robot."""
+"""Paths over time: reference poses and rates, with a time that waits for a robot that lags."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -8,21 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-STEP = 0.02
+ROW_PERIOD = 0.02
 """Time between two rows of a path [s]."""
 FULL_SPEED_M, WAIT_M = 0.02, 0.12
 """Distances of the robot from its reference below which a path keeps its speed, and above which it
 stops and waits; in between it slows down linearly [m]."""
-LONGEST = 0.5
+LONGEST_STEP = 0.5
 """Largest time step by which a path advances [s]."""
 
 
 class Path(eqx.Module):
-    """Pose and twist in the world over the path's own time, which waits for a robot that lags.
+    """Pose and twist in the world over the time of the path, which waits for a robot that lags.
 
     Attributes:
-        rows: x, y [m], heading [rad] and their rates [m/s, m/s, rad/s], one row every `STEP`.
-        marks: times at which a side, with the rest at its end, or a quarter of a curve ends [s].
+        rows: x, y [m], heading [rad] and their rates [m/s, m/s, rad/s], one row every `ROW_PERIOD`.
+        marks: times at which a side (including the rest at its end) or a quarter of a curve ends
+            [s].
         corners: reference positions at these times (mark, 2) [m].
     """
 
@@ -32,12 +33,12 @@ class Path(eqx.Module):
 
     @property
     def duration(self) -> float:
-        """Duration of the path in its own time [s]."""
-        return (len(self.rows) - 1) * STEP
+        """Duration of the path, in the time of the path [s]."""
+        return (len(self.rows) - 1) * ROW_PERIOD
 
     def at(self, time: Float[Array, ""] | float) -> Float[Array, "6"]:
         """Return pose and rates at a time of the path [s]; outside it, those of the nearer end."""
-        place = jnp.clip(jnp.asarray(time) / STEP, 0.0, len(self.rows) - 1.000001)
+        place = jnp.clip(jnp.asarray(time) / ROW_PERIOD, 0.0, len(self.rows) - 1.000001)
         low = jnp.floor(place).astype(jnp.int32)
         high, part = jnp.minimum(low + 1, len(self.rows) - 1), place - low
         return (1 - part) * self.rows[low] + part * self.rows[high]
@@ -45,7 +46,7 @@ class Path(eqx.Module):
     def remaining(self, time: Float[Array, ""] | float) -> Float[Array, ""]:
         """Return the path length that remains at a time of the path [m]."""
         steps = jnp.diff(self.rows[:, :2], axis=0)
-        after = jnp.clip(jnp.arange(1, len(self.rows)) - jnp.asarray(time) / STEP, 0.0, 1.0)
+        after = jnp.clip(jnp.arange(1, len(self.rows)) - jnp.asarray(time) / ROW_PERIOD, 0.0, 1.0)
         return jnp.sum(after * jnp.sqrt(jnp.sum(steps**2, axis=1)))
 
     def follow(
@@ -61,10 +62,10 @@ class Path(eqx.Module):
 
         The path slows down, and its rates with it, while the robot's estimated `pose` lags behind
         it or is off to the side; it does not wait for a robot that is ahead. A `dt` [s] that is not
-        a positive number counts as 0; the time advances by at most `LONGEST`.
+        a positive number counts as 0; the time advances by at most `LONGEST_STEP`.
         """
         dt = jnp.asarray(dt, dtype=float)
-        dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST), 0.0)
+        dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST_STEP), 0.0)
         here = self.at(time)
         gap, v = here[:2] - pose[:2], here[3:5]
         size = jnp.sqrt(v @ v + 1e-12)
@@ -78,7 +79,7 @@ class Path(eqx.Module):
         return time, jnp.concatenate([self.at(time)[:3], rates])
 
     def moved(self, start: Sequence[float]) -> "Path":
-        """Return the path placed for a robot that starts at a pose (x, y [m], heading [rad])."""
+        """Return the path moved so that it begins at a pose (x, y [m], heading [rad])."""
         x, y, heading = (float(v) for v in start)
         c, s = np.cos(heading), np.sin(heading)
         turn = np.array([[c, s], [-s, c]])
@@ -91,9 +92,9 @@ class Path(eqx.Module):
 
     def after_rest(self, seconds: float) -> "Path":
         """Return the path preceded by a rest of this duration at its start."""
-        count, rows = round(seconds / STEP), np.asarray(self.rows)
+        count, rows = round(seconds / ROW_PERIOD), np.asarray(self.rows)
         still = np.tile(rows[0] * [1, 1, 1, 0, 0, 0], (count, 1))
-        marks = jnp.asarray(np.asarray(self.marks) + count * STEP)
+        marks = jnp.asarray(np.asarray(self.marks) + count * ROW_PERIOD)
         return Path(jnp.asarray(np.concatenate([still, rows])), marks, self.corners)
 
 
@@ -120,16 +121,18 @@ def waypoints(
     _positive(speed, acceleration)
     p = np.asarray(places, float)
     if p.ndim != 2 or len(p) < 2 or p.shape[1] != 2:
-        raise ValueError(f"way-points {p.tolist()}; expected two or more places x, y")
+        raise ValueError(f"way-points {p.tolist()}; expected at least two points x, y")
     parts, marks, time = [np.array([[*p[0], 0.0, 0.0, 0.0, 0.0]])], [], 0.0
     for k, (a, b) in enumerate(itertools.pairwise(p)):
         length = float(np.hypot(*(b - a)))
         if length < 1e-9:
-            raise ValueError(f"way-point {b.tolist()} twice in a row; expected another place")
+            raise ValueError(
+                f"way-point {b.tolist()} twice in succession; expected different way-points"
+            )
         distance, rate = _trapezoid(length, speed, acceleration, pause)
         line = np.array([*(b - a), turn]) / length
         parts.append(np.hstack([[*a, k * turn] + distance[:, None] * line, rate[:, None] * line]))
-        time += len(distance) * STEP
+        time += len(distance) * ROW_PERIOD
         marks.append(time)
     rows = np.concatenate(parts)
     return Path(jnp.asarray(rows), jnp.asarray(marks), jnp.asarray(p[1:]))
@@ -181,7 +184,7 @@ def curve(
     quarters = np.searchsorted(distance, length[-1] * np.array([0.25, 0.5, 0.75]))
     at = np.append(quarters, len(distance) - 1)
     rows = np.hstack([place, still, rate[:, None] * slope, still])
-    return Path(jnp.asarray(rows), jnp.asarray(at * STEP), jnp.asarray(place[at]))
+    return Path(jnp.asarray(rows), jnp.asarray(at * ROW_PERIOD), jnp.asarray(place[at]))
 
 
 def circle(radius: float = 0.35, speed: float = 0.2) -> Path:
@@ -218,20 +221,20 @@ def _round(radius: float) -> Float[np.ndarray, "place 2"]:
 def _positive(speed: float, acceleration: float) -> None:
     """Raise `ValueError` unless speed and acceleration are both positive."""
     if not (speed > 0 and acceleration > 0):
-        raise ValueError(f"speed {speed}, acceleration {acceleration}; expected both positive")
+        raise ValueError(f"speed {speed}, acceleration {acceleration}; expected positive numbers")
 
 
 def _trapezoid(
     length: float, speed: float, acceleration: float, pause: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance [m] and speed [m/s] every `STEP` on a straight line with a rest at its end.
+    """Return distance [m] and speed [m/s] over time on a straight line with a rest at its end.
 
-    The speed ramps up, stays level and ramps down (trapezoidal profile).
+    Rows are `ROW_PERIOD` apart. The speed rises, stays constant and falls (trapezoidal profile).
     """
     top = min(speed, float(np.sqrt(length * acceleration)))
     ramp = top / acceleration
     whole = length / top + ramp
-    t = np.arange(1, int(np.ceil((whole + pause) / STEP)) + 1) * STEP
+    t = np.arange(1, int(np.ceil((whole + pause) / ROW_PERIOD)) + 1) * ROW_PERIOD
     up, down = np.minimum(t, ramp), np.clip(t - (whole - ramp), 0.0, ramp)
     level = np.clip(t - ramp, 0.0, whole - 2 * ramp)
     distance = 0.5 * acceleration * up**2 + top * level + top * down - 0.5 * acceleration * down**2

@@ -1,8 +1,8 @@
-"""The twin: the identified robot itself as a plant, on which closed-loop runs are rehearsed.
+"""The twin: the identified model of a robot as a plant for closed-loop runs.
 
-Commands reach the wheels after a delay, a slew limit and a lag. Wheels on several floors move the
-body by the contact model, and the model's errors are drawn again for every run, with effects as in
-`slipid.robot.filter.effects`:
+Commands reach the wheels with a delay, a limited acceleration and a lag. The body moves by the
+contact model with the floor under each wheel. The errors of the model are drawn at random for every
+run, with effects as in `slipid.robot.filter.effects`:
 
     set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
     xi = equilibrium(r w; floor under each wheel)
@@ -32,13 +32,13 @@ from slipid.robot.filter.effects import RolledMotion, effect_correlation, travel
 from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import Measurement, Pose, Readings
 
-RING = 6
-"""Number of past commands that are kept; the delay is at most `RING` - 1 periods."""
+KEPT_COMMANDS = 6
+"""Number of past commands that are kept; the delay is at most `KEPT_COMMANDS` - 1 periods."""
 
 
 @dataclass(frozen=True)
 class ActuatorModel:
-    """Response of the wheels to commands and noise of the sensors, which no fit determines.
+    """Response of the wheels to commands and noise of the sensors, which are not fitted.
 
     Attributes:
         delay_s: time until a command reaches the wheels [s].
@@ -48,13 +48,13 @@ class ActuatorModel:
         ammeter_a: std of the noise of a measured current [A].
         drift_s: correlation time of the errors of modelled currents [s].
         voltmeter_v: std of the noise of a measured voltage [V].
-        voltage: whether voltages are measured.
+        voltage: True if voltages are measured.
         gyro_noise: std of the noise of a measured yaw rate [rad/s].
         gyro_bias: std of the bias of a measured yaw rate [rad/s].
-        gyro: whether yaw rates are measured.
-        signed: whether measured currents have signs.
+        gyro: True if yaw rates are measured.
+        signed: True if measured currents have signs.
         substeps: number of simulation steps of wheels and body in a control period.
-        smooth: True for encoders without ticks, which measure angles exactly.
+        smooth: True for ideal encoders without ticks, which measure angles exactly.
     """
 
     delay_s: float = 0.12
@@ -90,10 +90,12 @@ class ActuatorModel:
         """
         h = self.substep
         begin = np.arange(self.substeps)[:, None] * h - self.delay_s
-        since = -np.arange(RING)[None, :] * PERIOD
+        since = -np.arange(KEPT_COMMANDS)[None, :] * PERIOD
         both = np.minimum(begin + h, since + PERIOD) - np.maximum(begin, since)
         share = np.clip(both, 0.0, None) / h
-        share[:, -1] += 1.0 - share.sum(axis=1)  # the oldest one replaces older commands
+        share[:, -1] += 1.0 - share.sum(
+            axis=1
+        )  # The oldest kept command stands for all older ones.
         return share
 
 
@@ -111,7 +113,8 @@ class TwinState(eqx.Module):
         offset: constant error of the currents in this run [A].
         drift: correlated error of the currents [A].
         bias: bias of the gyro [rad/s].
-        ring: last commands, some of which have not arrived yet, the newest first [rad/s].
+        ring: last commands, the newest first, some of which have not reached the wheels yet
+            [rad/s].
     """
 
     pose: Float[Array, "3"]
@@ -131,7 +134,7 @@ class Twin(eqx.Module):
     """A robot on a floor map, simulated by its own identified model.
 
     Attributes:
-        robot: robot with its true numbers.
+        robot: robot with its true parameters.
         floor: map of the surfaces, numbered as in `robot.labels`.
         actuators: response of the wheels and noise of the sensors.
     """
@@ -141,8 +144,8 @@ class Twin(eqx.Module):
     actuators: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
-        """Raise `ValueError` for a delay longer than the kept commands span."""
-        most = (RING - 1) * PERIOD
+        """Raise `ValueError` for a delay longer than the time of the kept commands."""
+        most = (KEPT_COMMANDS - 1) * PERIOD
         if not 0 <= self.actuators.delay_s <= most:
             raise ValueError(f"delay_s = {self.actuators.delay_s}; expected 0 to {most:g}")
 
@@ -152,7 +155,7 @@ class Twin(eqx.Module):
         return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
     def init(self, pose: Pose, key: Array) -> TwinState:
-        """Return the state at rest at a pose [m, m, rad], with errors drawn for this run."""
+        """Return the state at rest at a pose [m, m, rad], with random errors for this run."""
         f, w = self.robot, (self.robot.wheels,)
         one, two, three = jax.random.split(jax.random.fold_in(key, 2**31 - 1), 3)
         off = jax.random.normal(two, w) * jnp.mean(f.current_std) / jnp.sqrt(2.0)
@@ -168,7 +171,7 @@ class Twin(eqx.Module):
             offset=off,
             drift=zero,
             bias=self.actuators.gyro_bias * jax.random.normal(three),
-            ring=jnp.zeros((RING, *w)),
+            ring=jnp.zeros((KEPT_COMMANDS, *w)),
         )
 
     def step(
@@ -230,14 +233,14 @@ class Twin(eqx.Module):
         keep = float(np.exp(-PERIOD / self.actuators.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
-        moves = jnp.tanh(w / 0.2) ** 2  # a standing motor draws no current
+        moves = jnp.tanh(w / 0.2) ** 2  # A motor at standstill draws no current.
         model = f.standing(under).current(xi, w)
         free = (f.inverse @ (f.frame.radius * w))[:2]
         more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
         return model + moves * (jnp.sign(model) * more + now.offset + drift), drift
 
     def _read(self, angle: Array, w: Array, amps: Array, turn: Array, noise: Array) -> Readings:
-        """Return the readings, with NaN for everything that no sensor of this robot measures."""
+        """Return the readings, with NaN for all quantities that the robot does not measure."""
         b, wheels = self.actuators, self.robot.wheels
         _, by_amps, by_volts, by_turn = jnp.split(
             noise[3 * b.substeps :], [wheels, 2 * wheels, 3 * wheels]
@@ -263,7 +266,7 @@ class TwinPlant:
 
     def reset(self) -> Readings:
         self._count = 0
-        self._state, reading = _begun(self.twin, self.start, self.key)
+        self._state, reading = _first_step(self.twin, self.start, self.key)
         return reading
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
@@ -279,7 +282,7 @@ class TwinPlant:
 
 
 @eqx.filter_jit
-def _begun(twin: Twin, start: Array, key: Array) -> tuple[TwinState, Readings]:
+def _first_step(twin: Twin, start: Array, key: Array) -> tuple[TwinState, Readings]:
     state = twin.init(start, key)
     return state, twin.first(state, twin.noise(key, 0))
 

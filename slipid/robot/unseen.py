@@ -1,12 +1,12 @@
-"""Floors without a run, which a robot may meet in addition to the floors it was identified on.
+"""Hypothetical floors for a robot that may drive on floors without identified parameters.
 
 Floors differ mainly in softness. Over the floors in the public logs of 2022 and on the virtual test
 site, the logarithm of roller drag rises with the logarithm of creep at a slope of 0.8. So a floor
 without a run is assumed to be the geometric mean of the known floors, made softer or harder, with
 more friction or less. Currents and a gyro show which of these an unfamiliar floor resembles;
-without both sensors these floors have little influence, since their prior probability is low. Their
-parameters are not identified, and the motion on them is uncertain by a tenth of the path length and
-0.3 rad per metre.
+without these sensors the hypothetical floors have little influence, since their prior probability
+is low. Their parameters are not identified, and the motion on them is uncertain by a tenth of the
+path length and 0.3 rad per metre.
 """
 
 from dataclasses import replace
@@ -24,11 +24,11 @@ from slipid.robot.record import (
     plain,
 )
 
-SOFTNESS = (-2.0, -1.0, 0.0, 1.0, 2.0)
+LOG_CREEPS = (-2.0, -1.0, 0.0, 1.0, 2.0)
 """Logs of creep relative to the middle floor [1]; the declared prior std over floors is 1.5."""
-DRAG = 0.8
+DRAG_EXPONENT = 0.8
 """Exponent d of roller drag ~ creep^d over floors [1]."""
-GRIP = (-0.4, 0.4)
+LOG_FRICTIONS = (-0.4, 0.4)
 """Logs of friction relative to the middle floor [1]; the declared prior std over floors is 0.5."""
 EFFECT: Axes = (0.1, 0.1, 0.3)
 """Std of the effects on such a floor [m/m, m/m, rad/m]."""
@@ -39,9 +39,9 @@ _NAME = "unseen_{}"
 
 
 def with_unseen(record: RobotRecord) -> RobotRecord:
-    """Return the robot with floors without a run, `unseen_1`, `unseen_2`, ..., added at the end.
+    """Return the robot with hypothetical floors `unseen_1`, `unseen_2`, ..., added at the end.
 
-    A robot that has them already is returned unchanged.
+    A robot that already has them is returned unchanged.
 
     Raises:
         ValueError: a known floor has the name of one of them.
@@ -49,13 +49,15 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
     if any(floor.unseen for floor in record.floors):
         return record
     middle = _middle(record)
-    grid = tuple(product(SOFTNESS, GRIP))
+    grid = tuple(product(LOG_CREEPS, LOG_FRICTIONS))
     names = [_NAME.format(k + 1) for k in range(len(grid))]
     if taken := set(names) & set(record.labels):
-        raise ValueError(f"floor '{min(taken)}': this name is reserved for floors without a run")
+        raise ValueError(
+            f"floor '{min(taken)}': this name is reserved for hypothetical floors without a run"
+        )
     parameters = dict(record.parameters)
     for name, (soft, grip) in zip(names, grid, strict=True):
-        factor = {"creep": soft, "roller_drag": DRAG * soft, "friction": grip}
+        factor = {"creep": soft, "roller_drag": DRAG_EXPONENT * soft, "friction": grip}
         for quantity, number in middle.items():
             value = np.asarray(np.exp(factor.get(quantity, 0.0)) * np.asarray(number.value))
             parameters[f"surface.{name}.{quantity}"] = replace(number, value=plain(value))

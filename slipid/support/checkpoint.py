@@ -74,8 +74,8 @@ def key_of(*parts: object) -> str:
 class Checkpoint:
     """Finished parts of one job, keyed by name, in files of one folder.
 
-    A part is written completely or not at all. Damaged parts, and parts of other jobs, count as
-    absent, so that they are computed again.
+    A part is written completely or not at all. Damaged parts, and parts of other jobs, are treated
+    as absent, so that they are computed again.
 
     Attributes:
         folder: folder of the files; it is made with the first part.

@@ -49,7 +49,7 @@ class Processes(ProcessPoolExecutor):
     def submit(
         self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
-        with _interrupts_ignored():  # so that Ctrl-C interrupts only this process
+        with _interrupts_ignored():  # Ctrl-C then interrupts only this process.
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(
@@ -82,7 +82,7 @@ def results(
         report: reporter of the progress.
 
     Raises:
-        DataError: the system ended a process before its job was done.
+        DataError: a process was ended by the system before its job was finished.
     """
     found: list[Result] = []
     waiting: dict[Future[Result], str] = {}

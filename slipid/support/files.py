@@ -16,7 +16,7 @@ from slipid.support.errors import DataError
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file atomically: after a crash there is the old or the new file, never a part.
+    """Write a file atomically: after a crash, there is either the old or the new file.
 
     Raises:
         DataError: the file cannot be written.
@@ -74,7 +74,7 @@ def _plain(value: object) -> object:
 
 
 def read_json(path: Path, what: str) -> Any:
-    """Return the content of a JSON file that slipid wrote.
+    """Return the content of a JSON file.
 
     Raises:
         DataError: the file is missing or not JSON; the message names `what` was expected.
@@ -84,7 +84,7 @@ def read_json(path: Path, what: str) -> Any:
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; expected {what}") from error
     except ValueError as error:
-        raise DataError(f"{path}: no valid JSON ({error}); expected {what}") from error
+        raise DataError(f"{path}: not valid JSON ({error}); expected {what}") from error
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:

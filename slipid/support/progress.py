@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-EVERY_S = 2.0
+LINE_PERIOD_S = 2.0
 """Shortest time between two plain lines about one stage [s]."""
-MEMORY_S = 3600.0
+AVERAGING_S = 3600.0
 """Time over which the speed of progress is averaged for the remaining time [s]; it is long, since a
 step of a fit may take minutes."""
 
@@ -31,7 +31,7 @@ class Reporter:
             bars.TimeRemainingColumn(),
             console=self._console,
             transient=True,
-            speed_estimate_period=MEMORY_S,
+            speed_estimate_period=AVERAGING_S,
             # Without a terminal the bar is not shown, and only computes the remaining time.
             disable=quiet or not self._console.is_terminal,
         )
@@ -68,7 +68,8 @@ class Reporter:
     def advance(self, done: int | float, total: int | float, what: str | None = None) -> None:
         """Report the progress of the current stage.
 
-        Without a terminal a line is printed at most every `EVERY_S`, and at the end of the stage.
+        Without a terminal a line is printed at most every `LINE_PERIOD_S`, and at the end of the
+        stage.
 
         Args:
             done, total: finished and total amount of work in any unit; the total is constant
@@ -80,7 +81,7 @@ class Reporter:
         what = f"{done} of {total}" if what is None else what
         self._bars.update(self._task, completed=done, total=total, what=what)
         now = time.monotonic()
-        if not self._bars.disable or (now < self._reported + EVERY_S and done < total):
+        if not self._bars.disable or (now < self._reported + LINE_PERIOD_S and done < total):
             return
         self._reported = now
         left = next(task for task in self._bars.tasks if task.id == self._task).time_remaining

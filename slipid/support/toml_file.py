@@ -1,4 +1,4 @@
-"""Checking of TOML files against pydantic models; each mistake is a line that names its key."""
+"""Checking of TOML files against pydantic models; the error has a line for each mistake."""
 
 import tomllib
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
 
 CLOSED = ConfigDict(extra="forbid")
-"""Pydantic config of dataclasses that describe tables of a TOML file: unknown keys are refused."""
+"""Pydantic config of dataclasses that describe tables of a TOML file: unknown keys are errors."""
 Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
 Part = Annotated[float, Field(ge=0, lt=1)]
@@ -25,7 +25,7 @@ Step = str | int
 
 
 class Section(BaseModel):
-    """A table of a config: immutable, with only the keys it declares."""
+    """A table of a config: immutable, and without other keys than the declared ones."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -37,7 +37,7 @@ def text_of(path: Path, what: str = "a config") -> str:
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; expected {what} (TOML file)") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: no UTF-8 text; expected {what} (TOML file)") from error
+        raise DataError(f"{path}: not UTF-8 text; expected {what} (TOML file)") from error
 
 
 def mapping_of(path: Path, text: str) -> Content:
@@ -45,7 +45,7 @@ def mapping_of(path: Path, text: str) -> Content:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise DataError(f"{path}: no valid TOML: {error}") from error
+        raise DataError(f"{path}: not valid TOML: {error}") from error
 
 
 def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
@@ -112,7 +112,7 @@ def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
 
 
 def _spelled(steps: Sequence[Step]) -> str:
-    """Return a location as a text such as `a.b[2]`, in which items of lists count from 1."""
+    """Return a location as a text such as `a.b[2]`, in which items of lists are counted from 1."""
     out = ""
     for step in steps:
         if isinstance(step, int):

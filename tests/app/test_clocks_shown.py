@@ -41,7 +41,7 @@ def test_offsets_and_their_intervals_are_one_line():
 @pytest.mark.parametrize("drift", [1e-3, -1e-3])
 def test_implausible_clock_rates_raise_a_question(drift):
     text = shown(CLOCK, replace(CLOCK, drift=drift))
-    assert f"differ by up to {1e6 * drift:+.0f} ppm: is the video's frame rate right?" in text
+    assert f"differ by up to {1e6 * drift:+.0f} ppm: is the video's frame rate correct?" in text
 
 
 def test_the_robots_own_clock_needs_no_line():

@@ -96,7 +96,7 @@ def test_every_key_is_explained():
         key = line.partition(" = ")[0]
         if key in ("half_width_m", "drives", "delimiter", "first_data_row", "glob", "load"):
             assert " # " in line or line.startswith("#"), line
-    assert "half the track" in made("skid").text
+    assert "half the distance between the middles of the left" in made("skid").text
 
 
 def test_logs_without_ticks_have_speeds():

@@ -64,7 +64,7 @@ std_kg = 0.06
     [
         ("std_kg = 0.1", "weights.as_built: expected kg, or like, mass_kg and place_m"),
         ("kg = [3, 5, 4]", "weights.as_built.std_kg: missing"),
-        ('kg = [3, 5, 4]\nlike = "b"\nstd_kg = 1', "at once; expected one of both ways"),
+        ('kg = [3, 5, 4]\nlike = "b"\nstd_kg = 1', "expected either kg or the other three"),
         ('like = "b"\nmass_kg = 1\nstd_kg = 1', "expected kg, or like, mass_kg and place_m"),
         ("kg = [3, 5]\nstd_kg = 0.1", "weights.as_built.kg: 2; expected 3 numbers"),
         ("kg = [3, 5, -4]\nstd_kg = 0.1", "weights.as_built.kg"),
@@ -114,5 +114,5 @@ def test_runs_of_sections_with_one_session_name_belong_together(tmp_path):
     job = read_fit_task(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
     assert set(job.dataset.session) == {"may 3"}
     both = text.replace("session_name", 'session = "file"\nsession_name')
-    with pytest.raises(DataError, match="session and session_name at once"):
+    with pytest.raises(DataError, match="both session and session_name are given"):
         parsed(tmp_path / "my.toml", both)

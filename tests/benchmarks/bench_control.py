@@ -180,7 +180,7 @@ def rollouts(folder, robots, steps):
     def theirs():
         twist, pose, total = np.zeros((robots, 3)), np.zeros((robots, 3)), np.zeros(robots)
         at = [x.ctypes.data_as(ctypes.c_void_p) for x in (flat, table, pose, twist, total)]
-        counts = (steps, robots, contact.CHORD, contact.NEWTON)
+        counts = (steps, robots, contact.SETTLE_CHORD_STEPS, contact.SETTLE_NEWTON_STEPS)
         rollout(*counts, ctypes.c_double(dt), *at)
         return twist.T, pose.T, total
 

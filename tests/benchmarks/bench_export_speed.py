@@ -24,16 +24,16 @@ from slipid.model import contact
 from slipid.model.contact_balance import stand
 from slipid.model.geometry import mecanum
 from slipid.robot.controller import (
-    GIVES_UP_S,
-    GO_S,
-    LONGEST_I,
-    OBSERVE_S,
+    LARGEST_INTEGRAL,
+    OBSERVER_S,
+    RECOVERY_DRIVE_S,
     RECOVERY_GROWTH,
+    RECOVERY_LIMIT_S,
+    RECOVERY_TURN_S,
     STUCK_S,
-    TURN_S,
     Limits,
 )
-from slipid.robot.estimator import CURRENT_FROM
+from slipid.robot.estimator import SLIP_CURRENT
 from slipid.robot.filter import hypotheses
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.interface import UNTIMED_S, Settings
@@ -128,14 +128,14 @@ def numbers() -> str:
         "ACCELERATION_LIMIT": most.acceleration,
         "VOLTAGE_LIMIT": most.voltage,
         "TWIST_LIMIT": most.twist,
-        "LONGEST_I": LONGEST_I,
-        "OBSERVE": OBSERVE_S,
+        "LONGEST_I": LARGEST_INTEGRAL,
+        "OBSERVE": OBSERVER_S,
         "STUCK": STUCK_S,
-        "TURN": TURN_S,
-        "GO": GO_S,
+        "TURN": RECOVERY_TURN_S,
+        "GO": RECOVERY_DRIVE_S,
         "RECOVERY_GROWTH": RECOVERY_GROWTH,
-        "GIVES_UP": GIVES_UP_S,
-        "CURRENT_FROM": CURRENT_FROM,
+        "GIVES_UP": RECOVERY_LIMIT_S,
+        "CURRENT_FROM": SLIP_CURRENT,
         "UNTIMED": UNTIMED_S,
         "STALE": s.stale_s,
         "LONGEST": s.longest_s,
@@ -224,7 +224,11 @@ def test_contact_balance_beside_its_twin(tmp_path):
     rims = float(three_floors().frame.radius) * speed
     counts = np.array([steps, count], np.int64)
     (tmp_path / "given").write_bytes(counts.tobytes() + rims.tobytes() + floors.tobytes())
-    sizes = [f"-DCOMBINATIONS={count}", f"-DCHORDS={contact.CHORD}", f"-DNEWTONS={contact.NEWTON}"]
+    sizes = [
+        f"-DCOMBINATIONS={count}",
+        f"-DCHORDS={contact.SETTLE_CHORD_STEPS}",
+        f"-DNEWTONS={contact.SETTLE_NEWTON_STEPS}",
+    ]
     twin = f'-DTWIN="{HERE / "twin.c"}"'
     for name, flags in FLAGS.items():
         words = ["gcc", "-std=c99", *flags, *sizes, twin, HERE / "export_settle.c", "settled.c"]
@@ -252,7 +256,7 @@ ALL = 99
     quick([(2, 2), (3, 2), (4, 2), (5, 2), (2, ALL), (3, ALL), (4, ALL), (5, ALL)], [(2, 2)]),
 )
 def test_many_floors(tmp_path, monkeypatch, floors, changes):
-    monkeypatch.setattr(hypotheses, "CHANGES", changes)
+    monkeypatch.setattr(hypotheses, "MOST_CHANGES", changes)
     robot = known(mecanum(0.2, 0.15, 0.05, 20.0), [f"floor{k}" for k in range(floors)])
     made = Code(robot, control_loop_of(robot, ROWS["contact"]), PATH)
     fleet = Fleet(made, tmp_path, FAST)

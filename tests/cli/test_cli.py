@@ -55,7 +55,7 @@ def test_help_names_every_command():
 
 
 def test_help_keeps_words_in_brackets():
-    assert "plan of [selftest] in the config" in invoke("selftest", "--help").stdout
+    assert "planned in [selftest] of the config" in invoke("selftest", "--help").stdout
     assert "slipid[testsite]" in invoke("simulate", "--help").stdout
 
 
@@ -187,7 +187,7 @@ def test_a_log_without_motion_is_refused_before_anything_is_written(tmp_path):
     config = config_of(Case("still", lambda p: None, (), GENERIC), tmp_path)
     result = invoke("identify", config, "--data", data, "--out", tmp_path / "out", "--quiet")
     assert result.exit_code == 2
-    assert "no wheel moves 10 mm" in result.stderr
+    assert "no wheel rim moves by 10 mm" in result.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -262,7 +262,7 @@ def test_a_profile_of_what_is_not_fitted_is_2_before_the_fit(small, tmp_path):
     words = ("--data", folder / "logs", "--out", tmp_path / "out", "--profile", "robot.mass")
     result = invoke("identify", folder / "my.toml", *words)
     assert result.exit_code == 2
-    assert "--profile: robot.mass is fixed; a profile is of one free number" in result.stderr
+    assert "--profile: robot.mass is fixed; expected one free number" in result.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -326,7 +326,7 @@ def test_a_fit_that_does_not_converge_exits_with_1_and_reports_it(small, tmp_pat
     config.write_text(text, encoding="utf-8")
     result = invoke("identify", config, "--data", folder / "logs", "--out", tmp_path / "out")
     assert result.exit_code == 1
-    assert "NOT converged: 1 rounds without settling" in result.stdout
+    assert "NOT converged: 1 rounds without convergence" in result.stdout
     assert json.loads((tmp_path / "out/fit.json").read_text())["converged"] is False
 
 
@@ -446,7 +446,7 @@ def test_a_posterior_that_has_converged_is_0_and_takes_its_blocks_away(
     monkeypatch.setattr(
         diagnosis, "diagnose", lambda chain, plan: replace(found(chain, plan), converged=True)
     )
-    monkeypatch.setattr(posterior, "MOST_STILL", 1.0)
+    monkeypatch.setattr(posterior, "MOST_UNMOVED", 1.0)
     result = invoke("sample", out, *FEW)
     assert result.exit_code == 0, result.output
     assert "converged: worst is" in result.stdout
@@ -521,7 +521,7 @@ def test_sampling_that_was_killed_ends_as_if_it_had_not_been(sampled, small, tmp
     run.communicate()
     kept = len(list(out.glob("sampling/*.npz")))
     result = invoke("sample", out, *[w for w in FEW if w != "--quiet"])
-    assert f"going on from block {kept} " in result.output
+    assert f"continuing from block {kept} " in result.output
     import xarray
 
     with (
@@ -588,7 +588,7 @@ def test_export_writes_a_folder_and_detects_a_changed_byte(small, tmp_path):
     words = ("export", out / "robot.json", "--to", "table", "--out", out, "--quiet")
     refused = invoke(*words)
     assert refused.exit_code == 2
-    assert "gains.csv: changed after it was written, and would be lost" in refused.output
+    assert "gains.csv: changed since it was written, and would be overwritten" in refused.output
     path.write_bytes(written)
     again = invoke(*words)
     assert again.exit_code == 0, again.output
@@ -596,10 +596,10 @@ def test_export_writes_a_folder_and_detects_a_changed_byte(small, tmp_path):
 
 
 def test_export_names_missing_options(tmp_path):
-    assert "robot.json: not there" in invoke("export", tmp_path, "--out", tmp_path / "o").output
+    assert "robot.json: missing" in invoke("export", tmp_path, "--out", tmp_path / "o").output
     told = invoke("export", tmp_path)
     assert told.exit_code == 2
-    assert "name one with --out" in told.output
+    assert "--out is missing" in told.output
     assert invoke("export", tmp_path, "--check").exit_code == 2
 
 

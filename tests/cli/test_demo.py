@@ -63,7 +63,7 @@ def test_the_recording_is_what_its_config_drives():
 
 
 def test_a_plant_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(DataError, match="no plant 'gazebo'; expected recorded or mujoco"):
+    with pytest.raises(DataError, match="--plant gazebo: unknown; expected recorded or mujoco"):
         demo.run(tmp_path, "gazebo", None, InProcess(), Reporter(quiet=True))
 
 
@@ -150,4 +150,4 @@ def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_pa
     for ax, floor in zip(drawn, ("firm", "soft", "soft@moved"), strict=False):
         by = found["summary"][floor]
         mine, encoder = (100 * by[m]["endpoint_error_mean"] for m in ("identified", "encoder"))
-        assert f"end off by {mine:.1f} % (encoders {encoder:.1f} %)" in ax.get_title()
+        assert f"end-point error {mine:.1f} % (encoders {encoder:.1f} %)" in ax.get_title()

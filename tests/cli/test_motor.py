@@ -247,7 +247,7 @@ def test_commands_that_need_wheels_refuse_a_bench(identified, bench, words):
     where = {"OUT": identified, "CONFIG": bench / "bench.toml"}
     result = invoke(*(where.get(word, word) for word in words))
     assert result.exit_code == 2
-    assert f"`slipid {words[0]}` does not apply" in result.output
+    assert f"`slipid {words[0]}` is not made" in result.output
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ def test_no_answer_is_one_clear_error(tmp_path):
     out = tmp_path / "mine.toml"
     result = answered("", "new", "--out", out, "--drive", "skid")
     assert result.exit_code == 2
-    assert "no answer; expected one" in result.stderr
+    assert "no answer; expected an answer" in result.stderr
     assert "--yes" in result.stderr
     assert not out.exists()
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from slipid.data.align.clock import SURE_STD, Clock, best_clock, clock_of_poses
+from slipid.data.align.clock import SUFFICIENT_STD_S, Clock, best_clock, clock_of_poses
 from slipid.data.align.regression import MotionPair, StepNoise
 from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import read_logs, read_runs
@@ -83,7 +83,7 @@ def test_the_gyro_comes_first_and_wheels_only_where_it_determines_no_clock():
     clock = best_clock(views())
     assert clock is not None
     assert clock.source == "gyro"
-    assert clock.offset_std <= SURE_STD
+    assert clock.offset_std <= SUFFICIENT_STD_S
     drive.gyro = np.zeros_like(drive.gyro)
     other = best_clock([drive.by_gyro(), drive.by_wheels()])
     assert other is not None
@@ -263,7 +263,8 @@ def test_poses_of_another_run_are_refused_with_what_to_do(tmp_path):
     assert found.logs == ()
     (line,) = found.aside
     assert re.search(
-        r"set aside: .*run.poses.csv: .*does not determine its clock.*starts, stops", line
+        r"set aside: .*run.poses.csv: .*not determine the offset of its clock.*starts, stops",
+        line,
     )
 
 
@@ -321,5 +322,5 @@ def test_only_poses_may_have_a_clock_of_their_own():
     table = layout()
     columns = {"current": {"columns": ["i", "j", "k"], "unit": "A"}}
     table["beside"] = {"{stem}.poses.csv": {"format": "tracked", "columns": columns}}
-    with pytest.raises(DataError, match=r"poses\.csv: clock = 'own'; expected .* poses alone"):
+    with pytest.raises(DataError, match=r"poses\.csv: clock = 'own'; allowed only for a file"):
         declared_layout(table, "test")

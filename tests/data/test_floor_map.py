@@ -125,7 +125,7 @@ def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
         ),
         (('base = "table"', ""), "base: missing; expected a value"),
         (("extent_m = [0.0, 0.0, 1.0, 1.0]", ""), "extent_m: missing; expected a value"),
-        (("[0.0, 0.0, 1.0, 1.0]", "[1.0, 0.0, 0.0, 1.0]"), "expected lowest x, y"),
+        (("[0.0, 0.0, 1.0, 1.0]", "[1.0, 0.0, 0.0, 1.0]"), "expected lowest x, lowest y"),
         (("cell_m = 0.01", "cell_m = 0"), "cell_m: 0; expected: input should be greater than 0"),
         (
             ("cell_m = 0.01", "cells_m = 0.01"),
@@ -137,7 +137,7 @@ def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
             ("[0.2, 0.2], [0.6, 0.2]", '["a", 0.2], [0.6, 0.2]'),
             r"patch\[1\].polygon\[1\]\[1\]: 'a'",
         ),
-        (("schema", "= ="), "no valid TOML"),
+        (("schema", "= ="), "not valid TOML"),
         (("polygon", "polygn"), r"patch\[1\].polygn: no such key, did you mean polygon"),
         (("cell_m = 0.01", "cell_m = 0.0001"), "100000000 cells; expected at most"),
     ],
@@ -261,7 +261,7 @@ def test_cells_are_covered_by_their_middles():
         ),
         (('"confidence": 2.5', '"confidence": NaN'), r"confidence: nan; expected"),
         (('"colour": "#808080"', '"colour": "gray"'), r"properties\.colour: 'gray'; expected"),
-        (('"type": "Feature"', '"type" "Feature"'), "no valid JSON"),
+        (('"type": "Feature"', '"type" "Feature"'), "not valid JSON"),
     ],
 )
 def test_errors_of_a_geojson_map_are_named(tmp_path, change, match):
@@ -288,5 +288,5 @@ def test_geojson_without_a_map_is_refused(tmp_path):
     low = vector_map(ringed("table", WHOLE)).to_json()
     low["slipid"]["extent_m"] = [1.0, 0.0, 0.0, 1.0]
     path.write_text(json.dumps(low))
-    with pytest.raises(DataError, match="expected lowest x, y, then highest x, y"):
+    with pytest.raises(DataError, match="expected lowest x, lowest y, highest x, highest y"):
         read_map(path)

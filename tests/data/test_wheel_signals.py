@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slipid.data.wheel_signals import (
-    STALLED,
+    STALL_STEPS,
     body_steps,
     bridge_stalls,
     first_moved,
@@ -42,7 +42,7 @@ def test_stalls_are_bridged(rng):
     assert np.flatnonzero(stalled).tolist() == list(range(101, 108))
 
 
-@pytest.mark.parametrize(("rows", "stalls"), [(STALLED - 1, False), (STALLED, True)])
+@pytest.mark.parametrize(("rows", "stalls"), [(STALL_STEPS - 1, False), (STALL_STEPS, True)])
 def test_so_many_steps_without_change_are_a_stall_and_fewer_are_none(rng, rows, stalls):
     time, angle, frozen = stalled_run(rng, rows=rows)
     bridged, stalled = bridge_stalls(time, frozen)

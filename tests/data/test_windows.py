@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slipid.data.log import Log
-from slipid.data.runs import MOVED, collect, first_row
+from slipid.data.runs import MOVED_M, collect, first_row
 from slipid.data.wheel_signals import integral
 from slipid.data.windows import ammeter_variance, windows
 from slipid.support.errors import DataError
@@ -331,7 +331,7 @@ def test_motion_starts_where_the_fastest_rim_has_moved():
     data = collect([run(start=2.0)])
     row = first_row(data, 0, RADIUS)
     moved = RADIUS * np.abs(data.wheel_angle - data.wheel_angle[0]).max(axis=1)
-    assert moved[row] >= MOVED > moved[row - 1]
+    assert moved[row] >= MOVED_M > moved[row - 1]
     assert data.time[row] - data.time[0] > 2.0
 
 
@@ -349,13 +349,13 @@ def test_different_robots_are_refused():
 
 
 def test_runs_without_poses_are_refused():
-    with pytest.raises(DataError, match=r"b\.csv: no pose; expected the columns of a camera"):
+    with pytest.raises(DataError, match=r"b\.csv: no pose; expected pose columns"):
         collect([run("a.csv"), run("b.csv", pose=None, pose_fresh=None)])
 
 
 def test_a_robot_that_stands_is_refused():
     data = collect([run("a.csv"), run("still.csv", start=100.0)])
-    with pytest.raises(DataError, match=r"still\.csv: no wheel moves 10 mm; expected a run"):
+    with pytest.raises(DataError, match=r"still\.csv: no wheel rim moves by 10 mm; expected a run"):
         windows(data, RADIUS)
 
 

@@ -114,7 +114,7 @@ def test_a_map_of_another_frame_is_refused_and_a_small_one_leaves_cells_empty(sm
     little = half_carpet(tmp_path / "little.toml", -0.15, 0.15)
     done = invoke("floors", folder / "out", "--map", little, "--out", tmp_path / "o", *words)
     assert done.exit_code == 1
-    assert "of the wheels' places are beyond the map" in done.stdout
+    assert "of the wheel positions are outside the map" in done.stdout
     rows = pd.concat([pd.read_csv(path) for path in (tmp_path / "o").rglob("*.csv")])
     outside = rows.floor_1.isna()
     assert 0.0 < outside.mean() < 1.0

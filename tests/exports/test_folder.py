@@ -46,10 +46,10 @@ def test_added_and_lost_files_are_reported(folder):
 @pytest.mark.parametrize("sums", [b"", b"no digest here\n", b"\xff\xfe"])
 def test_a_folder_without_its_checksums_is_none(folder, sums):
     (folder / SUMS).write_bytes(sums)
-    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
+    with pytest.raises(DataError, match="expected a folder written by `slipid export`"):
         check_folder(folder)
     (folder / SUMS).unlink()
-    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
+    with pytest.raises(DataError, match="expected a folder written by `slipid export`"):
         check_folder(folder)
 
 
@@ -58,7 +58,7 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(folder):
     outside.write_bytes(b"")
     digest = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     (folder / SUMS).write_text(f"{digest}  ../other\n")
-    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
+    with pytest.raises(DataError, match="expected a folder written by `slipid export`"):
         check_folder(folder)
     with pytest.raises(DataError):
         write_folder(folder, CONTENT)
@@ -90,7 +90,7 @@ def test_what_is_built_of_it_is_no_part_of_it(folder):
 
 def test_a_file_that_was_changed_by_hand_is_never_lost(folder):
     (folder / "c/src/slipid.c").write_text("int own;\n")
-    with pytest.raises(DataError, match=r"slipid\.c: changed after it was written"):
+    with pytest.raises(DataError, match=r"slipid\.c: changed since it was written"):
         write_folder(folder, CONTENT)
     assert (folder / "c/src/slipid.c").read_text() == "int own;\n"
     assert (folder / "README.md").exists()
@@ -123,14 +123,14 @@ def test_what_a_killed_process_left_is_cleared(folder):
     write_folder(folder, CONTENT)
     assert sorted(check_folder(folder)) == sorted(CONTENT)
     (folder / ".mine.0123abcd").write_text("kept")
-    with pytest.raises(DataError, match="files that no export wrote"):
+    with pytest.raises(DataError, match="files that are not from an export"):
         write_folder(folder, CONTENT)
     assert (folder / ".mine.0123abcd").read_text() == "kept"
 
 
 def test_other_files_are_never_touched(folder):
     (folder / "mine.txt").write_text("kept")
-    with pytest.raises(DataError, match=r"files that no export wrote \(mine.txt\)"):
+    with pytest.raises(DataError, match=r"files that are not from an export \(mine.txt\)"):
         write_folder(folder, CONTENT)
     assert (folder / "mine.txt").read_text() == "kept"
     assert (folder / "README.md").read_bytes() == CONTENT["README.md"]

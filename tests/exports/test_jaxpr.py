@@ -14,7 +14,9 @@ from slipid.exports.c99.function import Argument, function, traced
 from slipid.exports.c99.jaxpr import Params, ScanParameters, Traced, called
 from slipid.support.errors import DataError
 
-UNKNOWN = rf"jax {jax.__version__} writes '?{{}}'? in a way .* does not know.*'jax>=0.10,<0\.\d+'"
+UNKNOWN = (
+    rf"jax {jax.__version__} represents '?{{}}'? in a way .* does not support.*'jax>=0.10,<0\.\d+'"
+)
 
 
 class _Tree(tuple):

@@ -365,14 +365,14 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
         (lambda x: x.at[np.array([1, 1])].add(1.0), "an index that occurs twice"),
         (lambda x: x.at[jnp.argmin(x)].set(1.0), "indices that are not constant"),
         (lambda x: x.at[jnp.argmin(x)].get(mode="fill"), "indices out of range that give"),
-        (lambda x: ~jnp.floor(x).astype(int), "of whole numbers"),
-        (lambda x: jnp.abs(jnp.floor(x).astype(int)), "of whole numbers"),
-        (lambda x: jnp.bitwise_and.reduce(jnp.floor(x).astype(int)), "of whole numbers"),
+        (lambda x: ~jnp.floor(x).astype(int), "for integers"),
+        (lambda x: jnp.abs(jnp.floor(x).astype(int)), "for integers"),
+        (lambda x: jnp.bitwise_and.reduce(jnp.floor(x).astype(int)), "for integers"),
         (lambda x: x.astype(jnp.uint8), "numbers of type uint8"),
         (lambda x: x.astype(jnp.float32), "numbers of type float32"),
         (lambda x: jax.lax.integer_pow(x, 0), "a power of 0"),
         (lambda x: jax.lax.select_n(jnp.argmin(x) * jnp.ones(N, int), x, x, 2 * x), "two cases"),
-        (lambda x: jax.lax.scan(lambda c, y: (c + y, c), 0.0, x)[1], "goes through an array"),
+        (lambda x: jax.lax.scan(lambda c, y: (c + y, c), 0.0, x)[1], "a scan over an array"),
     ],
 )
 def test_operations_with_other_results_in_c_are_refused(run, reason):

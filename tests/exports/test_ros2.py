@@ -39,7 +39,7 @@ def test_every_file_says_of_which_robot_it_is(robot, files):
             read(files, name)
         assert robot.record.numbers in text
         assert "as built" in text
-    assert "Load set-up: as built, of those known: as built, moved." in header(robot)
+    assert "Load set-up: as built; identified load set-ups: as built, moved." in header(robot)
     assert any(line.startswith("WARNING: NOT IDENTIFIED") for line in header(robot))
     assert all(line.isprintable() for line in header(robot))
 

@@ -86,9 +86,9 @@ def test_gains_are_those_the_controller_takes(robot):
     moved = DeployedRobot.of(robot.record, LOADS[1])
     by_hand, tuned = table(robot), table(moved)
     assert by_hand[0]["verdict"] == "by hand"
-    assert tuned[0]["verdict"] == "tuned, better than by hand"
+    assert tuned[0]["verdict"] == "tuned, better than set by hand"
     assert values(tuned, "gains") == USED
-    assert "those tuned are for the load set-up moved" in table_files(robot)["gains.md"]
+    assert "the tuned gains are for the load set-up moved" in table_files(robot)["gains.md"]
 
 
 def test_tables_for_reading_hold_whatever_a_name_is(robot):

@@ -404,7 +404,7 @@ def test_a_set_with_a_map_and_no_files_is_skipped(folder):
         (("maps/site.toml", "none.toml"), r"none\.toml: No such file.*expected a floor map"),
         (("site/*", "one_surface/gray/*"), "found by two globs of .*my.toml; expected it once"),
         (("map =", 'load = "far"\nmap ='), "load set-up 'far'.*expected one of as_built"),
-        (("map =", 'surface = "gray"\nmap ='), "surface and map at once"),
+        (("map =", 'surface = "gray"\nmap ='), "both surface and map are given"),
         (("map =", "maps ="), "did you mean map"),
     ],
 )
@@ -423,7 +423,9 @@ def test_every_floor_of_a_map_needs_runs_of_its_own(folder):
 
 def test_a_config_needs_runs_on_one_floor(folder):
     head = GOOD[: GOOD.index("[[logs]]")]
-    with pytest.raises(DataError, match="every section has a map; expected one without"):
+    with pytest.raises(
+        DataError, match="every section has a map; expected at least one section without"
+    ):
         read_config(written(folder, head + SITE))
 
 
@@ -526,7 +528,7 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     config, out = written(tmp_path, text), tmp_path / "out"
     said = invoke("identify", config, "--data", tmp_path / "logs", "--out", out)
     assert said.exit_code == 0, said.stderr
-    assert "were not used: they contradict those on one floor" in said.stderr
+    assert "were not used, since they contradict those on one floor" in said.stderr
     fit = load(out)
     assert fit.mixed is None
     assert fit.refused["reason"] in fit.messages

@@ -258,7 +258,7 @@ def test_going_on_from_a_state_is_the_same_as_not_having_stopped(surface_problem
 def test_too_few_rounds_are_said(surface_problem):
     short = optimise(surface_problem, start=begin(surface_problem), most_rounds=1)
     assert not short.converged
-    assert short.reason == "1 rounds without settling"
+    assert short.reason == "1 rounds without convergence"
 
 
 def test_left_out_runs_are_as_good_as_absent(truth, surface_problem):

@@ -15,9 +15,9 @@ from slipid.fitting.noise import SHARED, effects
 from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import FitState, Problem, effects_given, without_effects
 from slipid.fitting.shared_effects import (
-    LENGTH,
-    OTHER_LOAD,
-    OTHER_SIDE,
+    DIRECTION_LENGTH,
+    MIRROR_CORRELATION,
+    OTHER_LOAD_CORRELATION,
     SPEED_LENGTH,
     FittedEffects,
     SpeedAndLoad,
@@ -80,15 +80,19 @@ def test_neighbours_are_correlated_as_the_periodic_kernel_says(mirror):
     rows = [TravelConditions(turn, (p,) * len(turn), mirror).basis(pace) for p in pace]
 
     def near(apart):
-        return np.exp(-2 * (np.sin(apart / 2) / LENGTH) ** 2)
+        return np.exp(-2 * (np.sin(apart / 2) / DIRECTION_LENGTH) ** 2)
 
-    between = {(0, 0): 1.0, (0, 1): np.exp(-0.5 * (0.75 / SPEED_LENGTH) ** 2), (0, 2): OTHER_LOAD}
+    between = {
+        (0, 0): 1.0,
+        (0, 1): np.exp(-0.5 * (0.75 / SPEED_LENGTH) ** 2),
+        (0, 2): OTHER_LOAD_CORRELATION,
+    }
     for (i, j), share in between.items():
         # along alike to either side of the axis, across and in yaw the other way round
         for k, sign in enumerate((1, -1, -1)):
             expected = near(turn[:, None] - turn)
             if mirror is not None:
-                expected += sign * OTHER_SIDE * near(turn[:, None] + turn - 2 * mirror)
+                expected += sign * MIRROR_CORRELATION * near(turn[:, None] + turn - 2 * mirror)
             np.testing.assert_allclose(rows[i][k] @ rows[j][k].T, share * expected, atol=0.02)
 
 
@@ -113,11 +117,11 @@ def test_new_paces_keep_the_variance_of_the_process(mirror):
         by_number=np.zeros((3, 31, 1)),
         covariance=np.eye(count).reshape(3, 31, 3, 31),  # nothing was learnt
     )
-    near = np.exp(-2 * (np.sin(turn) / LENGTH) ** 2)
+    near = np.exp(-2 * (np.sin(turn) / DIRECTION_LENGTH) ** 2)
     for pace in (seen, other):
         told = of.forecast(TravelConditions(turn, (pace,) * 4, mirror))
         for k, sign in enumerate((1, -1, -1)):
-            whole = 1.0 if mirror is None else 1 + sign * OTHER_SIDE * near
+            whole = 1.0 if mirror is None else 1 + sign * MIRROR_CORRELATION * near
             expected = of.std[k] ** 2 * np.where(np.isfinite(turn), whole, 1.0)
             np.testing.assert_allclose(told.covariance[:, k, k], expected, rtol=0.03)
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.data.windows import UNREAD
+from slipid.data.windows import UNREAD_VARIANCE
 from slipid.fitting.problem import Problem
 from tests.helpers.made_windows import made, robot
 
@@ -31,8 +31,8 @@ def test_what_was_not_read_weighs_nothing():
         w,
         current=w.current + 3.0 * hidden,
         voltage=w.voltage + 20.0 * hidden,
-        current_var=np.where(hidden > 0, UNREAD, w.current_var),
-        voltage_var=UNREAD * hidden,
+        current_var=np.where(hidden > 0, UNREAD_VARIANCE, w.current_var),
+        voltage_var=UNREAD_VARIANCE * hidden,
     )
     there = hidden.reshape(len(w), -1) > 0
     for name, found in weights(spoilt).items():

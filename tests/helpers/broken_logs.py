@@ -304,7 +304,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "different numbers of wheels declared",
         _keep,
-        ("layout", "disagree on the number of wheels", "'current': 1"),
+        ("layout", "different numbers of wheels", "'current': 1"),
         GENERIC,
         {"columns": {"current": {"columns": ["left_a"], "unit": "A"}}},
     ),
@@ -345,7 +345,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "burst of missing values",
         _cell(range(80, 130), "m2pos", "NaN"),
-        ("exp07.csv row 80", "column 'm2pos'", "no value for 1.58 s", "one about every 0.031 s"),
+        ("exp07.csv row 80", "column 'm2pos'", "no value for 1.58 s", "values about every 0.031 s"),
     ),
     Case(
         "no value at all",
@@ -402,12 +402,12 @@ EXCHANGED = (
     Case(
         "swapped wheels",
         _swap_names("m1pos", "m3pos"),
-        ("exp07.csv", "match their wheel_speed", "order 3, 2, 1"),
+        ("exp07.csv", "match those of wheel_speed", "order 3, 2, 1"),
     ),
     Case(
         "reversed wheel",
         _cell(range(FIRST, _END), "m1pos", lambda cell: f"{-float(cell):.6g}"),
-        ("exp07.csv", "match their wheel_speed", "order -1, 2, 3"),
+        ("exp07.csv", "match those of wheel_speed", "order -1, 2, 3"),
     ),
 )
 """Logs whose encoders have exchanged or reversed columns: they are read, and sanity names them."""

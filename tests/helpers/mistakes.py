@@ -284,7 +284,7 @@ MISTAKES = (
     Mistake(
         "pose constant", ("pose_constant",), "marker", _each(pose=lambda r: 0 * r.pose + r.pose[0])
     ),
-    Mistake("pose constant in one run", ("pose_constant",), "leave these runs out", _one_constant),
+    Mistake("pose constant in one run", ("pose_constant",), "exclude these runs", _one_constant),
     Mistake("sign of the gyro", ("gyro_sign",), "gyro", _scaled("gyro", -1.0)),
     Mistake("gyro in deg/s", ("gyro_unit",), "channel gyro", _scaled("gyro", 180 / np.pi)),
     Mistake(

@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from slipid.fitting.likelihood import SMOOTH
+from slipid.fitting.likelihood import SMOOTHING_A
 from slipid.model import contact, contact_law
 from slipid.parameter import entries, share_basis
 
@@ -89,7 +89,7 @@ class Rival:
         torque = v["geometry", "wheel_radius"] * weight * borne
         drag = m["coulomb_friction"] * np.tanh(speed / 0.2) + m["viscous_friction"] * speed
         amps = (torque + drag) / (self.g.gear_ratio * m["efficiency"] * m["back_emf"])
-        amps = np.sqrt(amps**2 + SMOOTH**2) if not self.b.signed else amps
+        amps = np.sqrt(amps**2 + SMOOTHING_A**2) if not self.b.signed else amps
         pieces = len(self.b.dt)
         current = amps + m["current_offset"] - self.amps
         return {"motion": self.motion(v, xi), "current": current.reshape(pieces, -1)}
@@ -224,10 +224,10 @@ def equilibrium(rim, hold, roll, pull, shift, s, rest, base, near=None):
         return np.where(stuck[:, None], chord(xi), new) if stuck.any() else new
 
     if near is not None:
-        for _ in range(contact._MOST_NEAR):
+        for _ in range(contact._MOST_NEAR_STEPS):
             dx, _ = step(near)
             near = near - dx
-            if np.abs(dx).max() < contact._NEAR:
+            if np.abs(dx).max() < contact._CONVERGED_STEP:
                 return near
     j = hold
     xi = 0.8 * np.linalg.solve(j.T @ j + 1e-6 * np.eye(3), j.T @ (rim * pull).T).T

@@ -1,7 +1,7 @@
 """Real logs through the deployed estimator: what it hears of a run, and how its end is judged.
 
 The floor is unknown to it, the pose is used once: the first one after the wheels moved
-`slipid.data.wheel_signals.MOVED`. Its poses are of the encoders' time, the camera's lag
+`slipid.data.wheel_signals.MOVED_M`. Its poses are of the encoders' time, the camera's lag
 is taken off.
 """
 

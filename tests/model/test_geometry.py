@@ -155,7 +155,7 @@ def test_rank_below_three_has_the_smallest_twist_that_comes_nearest(g):
 
 
 def test_wheels_at_one_point_are_refused():
-    with pytest.raises(ValueError, match="all wheels stand at the origin"):
+    with pytest.raises(ValueError, match="all wheels are at the origin"):
         general([(0.0, 0.0)] * 3, [0.0, 120.0, 240.0], [90.0] * 3, 0.05)
 
 

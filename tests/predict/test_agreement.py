@@ -75,7 +75,7 @@ def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green
 
 @pytest.mark.parametrize(
     ("sigma", "reason"),
-    [(3.9, None), (25.0, "moves by 25 standard errors"), (np.inf, "did not settle")],
+    [(3.9, None), (25.0, "changes by 25 standard errors"), (np.inf, "did not converge")],
 )
 def test_numbers_that_move_far_are_a_contradiction(sigma, reason):
     found = contradiction(FINE, ("robot.load_share", sigma), 0.02, {"gray": 0.05})

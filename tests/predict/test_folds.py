@@ -168,7 +168,7 @@ def test_a_clear_winner_is_named_and_a_difference_within_its_error_is_not():
     verdicts = {name: one.verdict for name, one in ranked.models.items()}
     assert sorted(verdicts.values()) == ["best", "tied", "worse"]
     assert verdicts["constant"] == "worse"
-    assert "cannot tell contact equilibrium from linear" in ranked.sentence
+    assert "cannot distinguish contact equilibrium from linear" in ranked.sentence
     alone = ranking(rows({"identified": base, "constant": base - 4.0}))["floor"]
     assert alone.sentence.startswith("floor: contact equilibrium is best; next constant, 4.0")
 
@@ -275,7 +275,7 @@ def test_models_that_say_the_same_can_hardly_be_told_apart():
             assert verdict.pop("constant") in ("best", "tied")
             others += verdict.values()
             if "worse" not in verdict.values():
-                assert f"{name}: the data cannot tell" in floor.sentence
+                assert f"{name}: the data cannot distinguish" in floor.sentence
     assert others.count("worse") <= 4  # of twelve
 
 

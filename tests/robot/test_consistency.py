@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.effects import SETTLES, TURN, effect_correlation
+from slipid.robot.filter.effects import DIRECTION_STD, SETTLING_LENGTH, effect_correlation
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.pose_filter import PoseFilter, _scalar_update
@@ -176,12 +176,12 @@ def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice(
 def test_an_effect_correlates_over_a_turn_as_the_kernel_says_in_however_many_steps(steps):
     for turn in (0.0, 0.1, 0.3, np.pi):
         before, now = np.eye(3)[0], np.array([np.cos(turn), np.sin(turn), 0.0])
-        far = jnp.asarray(10 * SETTLES / steps)
+        far = jnp.asarray(10 * SETTLING_LENGTH / steps)
         kept, v = 1.0, jnp.asarray(before)
         for _ in range(steps):
             v, keep = effect_correlation(v, jnp.asarray(now), jnp.zeros(1), far)
             kept *= float(keep[0])
-        expected = np.exp(-np.sum((now - before) ** 2) / (2 * TURN**2))
+        expected = np.exp(-np.sum((now - before) ** 2) / (2 * DIRECTION_STD**2))
         assert kept == pytest.approx(expected, abs=1e-3)
 
 

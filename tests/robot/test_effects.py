@@ -11,7 +11,7 @@ import pytest
 
 from slipid.fitting import shared_effects as shared
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.effects import FORGETS, EffectLookup, RolledMotion
+from slipid.robot.filter.effects import LOG_SPEED_STD, EffectLookup, RolledMotion
 from slipid.robot.interface import Measurement, Settings
 from tests.helpers.small_twin import deployed
 from tests.helpers.stepped import stepped
@@ -47,7 +47,7 @@ def test_the_table_is_met_at_its_rows_and_is_linear_between_them():
 
 
 def test_estimates_fade_beyond_the_table_and_on_the_spot():
-    mean, part = at(np.pi / 4, 0.4 * np.exp(FORGETS))
+    mean, part = at(np.pi / 4, 0.4 * np.exp(LOG_SPEED_STD))
     keep = np.exp(-0.5)
     np.testing.assert_allclose(mean[1, 0], keep * 0.01, rtol=1e-6)
     np.testing.assert_allclose(part, np.sqrt(1 - keep**2 * (1 - 0.7**2)), rtol=1e-6)
@@ -57,7 +57,7 @@ def test_estimates_fade_beyond_the_table_and_on_the_spot():
 
 
 def test_effects_fade_with_speed_as_the_fit_has_it():
-    assert FORGETS == shared.SPEED_LENGTH
+    assert LOG_SPEED_STD == shared.SPEED_LENGTH
 
 
 MISSED = jnp.asarray([[0.02, -0.01, 0.1], [-0.05, 0.03, -0.2]])

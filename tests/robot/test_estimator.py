@@ -18,7 +18,7 @@ from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.controller import LONGEST_I, Controller, Gains, Limits, limit_command
+from slipid.robot.controller import LARGEST_INTEGRAL, Controller, Gains, Limits, limit_command
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
@@ -521,8 +521,10 @@ def test_the_integral_asks_for_no_more_than_it_may_however_long_a_robot_is_off()
     state = con.init()
     for _ in range(40):
         state, command = step(state, estimate(f))
-    np.testing.assert_allclose(state.integral, [LONGEST_I, -LONGEST_I], rtol=1e-12)
-    np.testing.assert_allclose(command, wheels([LONGEST_I, -LONGEST_I, 0.0]), rtol=1e-9)
+    np.testing.assert_allclose(state.integral, [LARGEST_INTEGRAL, -LARGEST_INTEGRAL], rtol=1e-12)
+    np.testing.assert_allclose(
+        command, wheels([LARGEST_INTEGRAL, -LARGEST_INTEGRAL, 0.0]), rtol=1e-9
+    )
 
 
 def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_and_says_so():

@@ -14,7 +14,7 @@ from slipid.robot import trajectory
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Gains
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.floor import LEAK, SPREAD
+from slipid.robot.filter.floor import MAP_ERROR, SPREAD
 from slipid.robot.filter.floor_filter import FloorFilter, TimeStep, _followed
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.filter.pose_filter import PoseFilter
@@ -45,7 +45,7 @@ def test_a_pose_that_is_known_has_the_floors_of_the_map():
     got = there.supports(pose, 1e-9 * jnp.eye(3), robot.places, hypotheses, 2).mean(axis=0)
     under = np.asarray(there.under(pose, robot.places))
     k = int(np.flatnonzero((hypotheses == under).all(axis=1))[0])
-    assert float(got[k]) == pytest.approx((1 - LEAK / 2) ** 3)
+    assert float(got[k]) == pytest.approx((1 - MAP_ERROR / 2) ** 3)
     assert float(jnp.sum(got)) == pytest.approx(1.0)
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from slipid.model.geometry import general
-from slipid.robot.filter.hypotheses import CHANGES, _hypotheses
+from slipid.robot.filter.hypotheses import MOST_CHANGES, _hypotheses
 
 
-def ways(place, floors, changes=CHANGES, unseen=0):
+def ways(place, floors, changes=MOST_CHANGES, unseen=0):
     """Return the hypotheses of known floors and, after them, unseen ones."""
     around = general(place, [0.0] * len(place), [90.0] * len(place), 0.05).around
     return _hypotheses(around, (False,) * floors + (True,) * unseen, changes)

@@ -143,7 +143,7 @@ def test_draws_are_robots_with_other_numbers(robot):
 
 def test_a_robot_whose_arrays_were_changed_is_not_saved(robot, tmp_path):
     changed = eqx.tree_at(lambda r: r.mass, robot, robot.mass + 1)
-    with pytest.raises(ValueError, match="arrays of this robot are not those of its record"):
+    with pytest.raises(ValueError, match="arrays of this robot differ from its record"):
         changed.save(tmp_path / "robot.json")
     assert not any(tmp_path.iterdir())
 
@@ -208,13 +208,13 @@ def refused(path: Path) -> str:
 def test_what_is_no_robot_is_refused(tmp_path):
     path = tmp_path / "robot.json"
     assert "No such file" in refused(path)
-    assert "expected what `slipid identify` writes" in refused(path)
+    assert "expected a robot.json of `slipid identify`" in refused(path)
     assert "irectory" in refused(tmp_path)
     for text in ("", "{", '{"a": NaN}', '{"a": 1, "a": 2}', "[" * 100_000, '{"a": 1e}'):
         path.write_text(text)
-        assert "no valid JSON" in refused(path)
+        assert "not valid JSON" in refused(path)
     path.write_bytes(b"\xff\xfe")
-    assert "no valid JSON" in refused(path)
+    assert "not valid JSON" in refused(path)
     for text in (
         "{}",
         "3",
@@ -223,7 +223,7 @@ def test_what_is_no_robot_is_refused(tmp_path):
         '{"schema": "slipid.robot/x"}',
     ):
         path.write_text(text)
-        assert "no robot of slipid" in refused(path)
+        assert "not a robot of slipid" in refused(path)
 
 
 def test_a_newer_file_asks_for_an_update(path):
@@ -237,14 +237,14 @@ def test_an_older_file_whose_law_was_another_is_to_be_written_anew(path):
     rewritten(path, lambda c: c.update(schema="slipid.robot/2"))
     said = refused(path)
     assert "written by an older slipid as slipid.robot/2" in said
-    assert "write it anew with `slipid identify`" in said
+    assert "write it again with `slipid identify`" in said
 
 
 def test_a_changed_digit_is_refused(path):
     text = path.read_text()
     path.write_text(text.replace("0.003", "0.004", 1))
     assert "does not match its checksum" in refused(path)
-    assert "write it anew with `slipid identify`" in refused(path)
+    assert "write it again with `slipid identify`" in refused(path)
     path.write_text(text.replace('"gyro": true', '"gyro": false', 1))
     assert "does not match its checksum" in refused(path)
 
@@ -274,7 +274,7 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c["loads"][1].pop("told"), "loads[1].told is missing"),
         (
             lambda c: c["loads"][1]["told"].update(speeds=[0.3, 0.1]),
-            "loads, moved: told.speeds: [0.3, 0.1]; expected positive ones that rise",
+            "loads, moved: told.speeds: [0.3, 0.1]; expected positive speeds in rising order",
         ),
         (lambda c: c["loads"][1]["told"]["mean"].pop(), "told.mean: 1 entries; expected 2"),
         (
@@ -293,7 +293,7 @@ def test_a_changed_digit_is_refused(path):
             lambda c: c["wheels"].update(drive_angle=[0.0]),
             "wheels.drive_angle: 1 entries; expected 3",
         ),
-        (lambda c: c["wheels"].update(roller_angle=[0.0] * 3), "such a wheel cannot drive"),
+        (lambda c: c["wheels"].update(roller_angle=[0.0] * 3), "the wheel cannot drive"),
         (lambda c: c["wheels"].update(drive_of=[0, 0, 2]), "counted from 0 without a gap"),
         (lambda c: c["wheels"].update(drive_of=[0, 0]), "expected one for each of the 3 wheels"),
         (lambda c: c["wheels"].update(drive_of=[0, 1, 0.5]), "drive_of"),
@@ -318,15 +318,21 @@ def test_a_changed_digit_is_refused(path):
             lambda c: c["draws"]["surface.soft.load_bias"].__setitem__(1, [0.1, 0.1, 0.1]),
             "draws['surface.soft.load_bias'][1] = ",
         ),
-        (lambda c: c["draws"]["surface.soft.friction"].pop(), "draws: [4, 5] of different numbers"),
+        (
+            lambda c: c["draws"]["surface.soft.friction"].pop(),
+            "draws: [4, 5] draws of different parameters",
+        ),
         (
             lambda c: c["draws"]["surface.soft.friction"].__setitem__(0, 0),
             "draws['surface.soft.frict",
         ),
-        (lambda c: c["draws"].update(mass=[1]), "'mass': no such number"),
+        (lambda c: c["draws"].update(mass=[1]), "'mass': not a parameter"),
         (lambda c: c["units"].update(alike="m"), "other units"),
         (lambda c: c["gains"]["values"].pop("yaw"), "gains.values.yaw is missing"),
-        (lambda c: c.update(loads=c["loads"][:1] * 2), "expected one or more, each once"),
+        (
+            lambda c: c.update(loads=c["loads"][:1] * 2),
+            "expected at least one name, and each only once",
+        ),
         (lambda c: c.update(floors=[]), "floors []; expected one or more"),
     ],
 )
@@ -339,7 +345,7 @@ def test_missing_and_wrong_fields_are_named(path, change, said):
         rewritten(path, change)
     found = refused(path)
     assert said in found
-    assert "write it anew with `slipid identify`" in found
+    assert "write it again with `slipid identify`" in found
 
 
 def test_another_load_set_up_is_refused_with_those_there_are(path):

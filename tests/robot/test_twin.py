@@ -10,7 +10,7 @@ from slipid.robot.closed_loop import ControlLoop, Plant, run_closed_loop
 from slipid.robot.controller import Controller, Gains
 from slipid.robot.estimator import Odometry
 from slipid.robot.trajectory import waypoints
-from slipid.robot.twin import RING, ActuatorModel, Twin, TwinPlant
+from slipid.robot.twin import KEPT_COMMANDS, ActuatorModel, Twin, TwinPlant
 from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor, stacked
 
@@ -40,7 +40,7 @@ def test_commands_arrive_late_as_a_fine_grid_says():
         share = ActuatorModel(delay_s=delay).command_weights()
         grid = (np.arange(100_000) + 0.5) / 100_000 * 0.05
         index = -np.floor((grid - delay) / 0.05).astype(int)
-        brute = [[np.mean(part == k) for k in range(RING)] for part in np.split(index, 2)]
+        brute = [[np.mean(part == k) for k in range(KEPT_COMMANDS)] for part in np.split(index, 2)]
         np.testing.assert_allclose(share, brute, atol=1e-4)
         np.testing.assert_allclose(share.sum(axis=1), 1.0)
 

@@ -18,11 +18,11 @@ from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.interface import Readings, Settings
 from slipid.robot.record import EffectRecord
-from slipid.robot.unseen import GRIP, SOFTNESS, with_unseen
+from slipid.robot.unseen import LOG_CREEPS, LOG_FRICTIONS, with_unseen
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.small_twin import deployed
 
-COUNT = len(SOFTNESS) * len(GRIP)
+COUNT = len(LOG_CREEPS) * len(LOG_FRICTIONS)
 SOFT = {"friction": 0.5, "creep": 0.6, "roller_drag": 0.95}
 """Softer than the floors of the robot as floors are, between two of the unseen ones."""
 OTHER = {"friction": 0.5, "creep": 0.9, "roller_drag": 0.5}

@@ -24,7 +24,7 @@ def test_stages_and_sentences_are_lines_and_progress_is_one_now_and_then(capsys)
 
 
 def test_the_time_left_is_that_of_the_steps_after_the_first(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    monkeypatch.setattr(progress, "LINE_PERIOD_S", 0.0)
     now = [0.0]
     with Reporter() as report:
         monkeypatch.setattr(report._bars, "get_time", lambda: now[0])
@@ -42,7 +42,7 @@ def test_the_time_left_is_that_of_the_steps_after_the_first(capsys, monkeypatch)
 
 
 def test_lines_come_no_closer_than_they_should(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY_S", 0.05)
+    monkeypatch.setattr(progress, "LINE_PERIOD_S", 0.05)
     with Reporter() as report:
         report.stage("driving")
         began = time.monotonic()

@@ -26,7 +26,7 @@ class ConfigLine:
         value: value as TOML text.
         comment: meaning of the key.
         question: question that the user has to answer here; empty if there is none.
-        commented_out: whether the line is written as a comment, without effect.
+        commented_out: True if the line is written as a comment, without effect.
     """
 
     key: str

@@ -68,7 +68,7 @@ class LogsDraft:
             is not written, so that the default holds.
         above: comments above the section.
         question: open question about the surface; empty if there is none.
-        commented_out: whether the section is written as a comment, without effect.
+        commented_out: True if the section is written as a comment, without effect.
     """
 
     glob: str

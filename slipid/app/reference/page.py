@@ -53,10 +53,11 @@ def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
 
 
 _INTRODUCTION = """\
-# What a config may say
+# Keys of a config
 
-Written by `slipid reference`, from the models that check a config; do not edit. `slipid new` writes
-a config with what your robot needs of this, `configs/` has one for each public data set."""
+This page is written by `slipid reference` from the code that checks a config; do not edit it.
+`slipid new` writes a config with the keys that your robot needs, and `configs/` has a config for
+each public data set."""
 
 
 def _config(_: object) -> str:
@@ -71,8 +72,8 @@ _FRAMES = """\
 
 The frame of the robot has x ahead, y to the left and yaw counter-clockwise, seen from above, in
 metres and radians; its origin is the middle of the wheels. Columns of the logs, and every list with
-a value per wheel, are in the order of the wheels. Where wheels share a motor, columns are in the
-order of `drives`. A positive speed of a wheel rolls the robot along the arrow of that wheel."""
+a value per wheel, are in the order of the wheels. If wheels share a motor, columns are in the
+order of `drives`. A wheel with a positive speed pushes the robot in the direction of its arrow."""
 
 
 def _drives(_: object) -> str:
@@ -90,19 +91,21 @@ def _drives(_: object) -> str:
 _LAYOUT = """\
 ## Layouts
 
-`[layouts.NAME]` says how one kind of log file is laid out, and `format = "NAME"` in `[[logs]]` uses
-it. `format` in a layout names a preset, which its other keys change. `[layouts.NAME.columns]` has a
-line for each channel, `CHANNEL = { column = "name", unit = "deg" }`, or `false` to take one of a
-preset away. `[layouts.NAME.beside."FILE"]` is a layout for a file beside a run's own."""
+`[layouts.NAME]` describes the columns of one kind of log file; `[[logs]]` refers to it by
+`format = "NAME"`. A layout may start from a preset (`format = "PRESET"`), which its other keys
+change. `[layouts.NAME.columns]` has a line for each channel,
+`CHANNEL = { column = "name", unit = "deg" }`, or `CHANNEL = false` to remove a channel of the
+preset. `[layouts.NAME.beside."FILE"]` is the layout of an additional file that lies in the same
+folder as the log file of a run."""
 
 
 _BAGS = """\
 ### Bags
 
-`kind = "bag"` makes a layout one of ROS bags (rosbag1, rosbag2, MCAP). `[layouts.NAME.topics]` has
-a line for each channel, `CHANNEL = { topic = "/name" }`, where `pose` and `twist_command` stand for
-the three numbers that a message holds together. Keys about encoders, currents and jumps are as
-above."""
+A layout with `kind = "bag"` describes ROS bags (rosbag1, rosbag2, MCAP). `[layouts.NAME.topics]`
+has a line for each channel, `CHANNEL = { topic = "/name" }`; the channels `pose` and
+`twist_command` stand for all three components in one message. The keys about encoders, currents
+and jumps are those of the table above."""
 
 
 def _layouts(_: object) -> str:
@@ -124,7 +127,10 @@ def _explained(kind: type) -> tuple[str, str]:
 
 def _channels(_: object) -> str:
     rows = [(f"`{name}`", _unit_text(unit), _columns(name)) for name, unit in CHANNELS.items()]
-    head = "## Channels\n\nWhat a column may hold, and the unit that slipid turns it into."
+    head = (
+        "## Channels\n\nQuantities that columns can contain, and the units to which they are "
+        "converted."
+    )
     return f"{head}\n\n{_table(('channel', 'unit', 'columns'), rows)}"
 
 
@@ -141,8 +147,8 @@ def _units(_: object) -> str:
 
 {known}
 
-Products, quotients and prefixes of these are understood as well (`mm/s`, `kN*m`). An angle is a
-dimension of its own, so that `Hz` is no `rad/s`. `pixel` needs `metres_per_pixel`."""
+Products, quotients and prefixes of these are understood as well (`mm/s`, `kN*m`). Angles have
+a dimension, so that `Hz` cannot be converted to `rad/s`. `pixel` needs `metres_per_pixel`."""
 
 
 def _presets(_: object) -> str:
@@ -150,7 +156,7 @@ def _presets(_: object) -> str:
         (f"`{name}`", ", ".join(layout.channels), ", ".join(map(str, layout.columns[:4])) + " ...")
         for name, layout in PRESETS.items()
     ]
-    head = "## Presets\n\nLayouts of published logs, for `format`."
+    head = "## Presets\n\nLayouts of published logs, which `format` can name."
     return f"{head}\n\n{_table(('preset', 'channels', 'first columns'), rows)}"
 
 
@@ -160,9 +166,9 @@ def _parameters(config: "c.Config | None") -> str:
     head = f"""\
 ## Parameters
 
-Of {whose}. `FLOOR` and `SESSION` stand for names in the
-logs. In `[parameters]` a pattern such as `"surface.*.creep"` holds for every parameter that it
-matches."""
+Parameters of {whose}. `FLOOR` and `SESSION` stand for names in
+the logs. In `[parameters]` a pattern such as `"surface.*.creep"` applies to every parameter that
+it matches."""
     columns = ("parameter", "numbers", "symbol", "unit", "meaning", "start", "default prior")
     cells = [
         (f"`{r.path}`", str(r.size), r.symbol, _unit_text(r.unit), r.means, r.start, r.prior)

@@ -85,7 +85,7 @@ class Board:
         columns, rows: number of squares along x and along y.
         square_m, marker_m: edge length of a square and of a marker [m].
         dictionary: dictionary of its markers, such as `4X4_50`.
-        legacy: whether it was drawn by OpenCV before 4.6, which began boards of an even number of
+        legacy: True if it was drawn by OpenCV before 4.6, which began boards of an even number of
             rows with a white square.
     """
 
@@ -176,7 +176,7 @@ class View:
 
     @property
     def flat(self) -> bool:
-        """Whether its corners do not determine the board's pose: too few, or all near one line."""
+        """True if its corners do not determine the board's pose: too few, or all near one line."""
         if len(self.pixels) < LEAST_CORNERS:
             return True
         steps = np.unique(np.round(np.diff(np.unique(self.board_m)), 9))

@@ -45,7 +45,7 @@ class FloorFit:
         twin_px: root mean square error of the next best pose that also looks down [pixel]; None if
             there is none.
         left_out: sentences about points that do not fit.
-        disputed: whether some points that do not fit could not be excluded from the fit.
+        disputed: True if some points that do not fit could not be excluded from the fit.
     """
 
     camera: OverheadCamera
@@ -159,7 +159,7 @@ def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
     fits = [FloorFit(camera_of(lens, pose), pose, points) for pose in poses]
     fits.sort(key=lambda fit: fit.rms_px)
     above = [fit for fit in fits if fit.camera.place[2] > 0 and fit.camera.rotation[2, 2] < 0]
-    # of two poses with similar errors the one above the floor is taken, if its error is acceptable
+    # of two poses with similar errors, choose the one above the floor if its error is acceptable
     if not above or above[0].rms_px > max(TWIN_RATIO * fits[0].rms_px, LEAST_BAD_PX):
         return None
     best, *others = above

@@ -14,8 +14,8 @@ from slipid.support.errors import DataError
 LEAST_CELLS, MOST_CELLS = 400, 4_000_000
 """Smallest and largest number of cells of a map."""
 FARTHEST_IN_HEIGHTS = 3.0
-"""Distance from the point below the lens up to which the floor is mapped, in heights of the lens
-above the floor [1]."""
+"""Largest distance of mapped floor from the point below the lens, in heights of the lens above the
+floor [1]."""
 
 
 class Extent(NamedTuple):

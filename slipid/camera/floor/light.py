@@ -22,7 +22,7 @@ square misfit of colours [1]."""
 ALTERNATIONS = 6
 """Number of iterations in which illumination and colours are fitted alternately."""
 DARK = 0.03
-"""Linear RGB value up to which noise is about constant; above it noise grows with the value [1]."""
+"""Linear RGB value below which noise is about constant; above it noise grows with the value [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ class Illumination:
 
 @dataclass(frozen=True, eq=False)
 class ColourSamples:
-    """Colours in the picture at places whose surface is taken as known.
+    """Colours in the picture at places whose surface is assumed to be known.
 
     Attributes:
         at: x and y of each place, from -1 to 1 over the picture.

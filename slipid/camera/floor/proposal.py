@@ -152,7 +152,7 @@ def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
     for near in JOIN_LIMITS:
         grouped = replace(samples, surface=own[samples.surface])
         start = LitColours(Illumination.uniform(), _means(grouped))
-        plain = _evenly(lab_of(_relit(fit_illumination(grouped, start).illumination, samples)))
+        plain = _perceptual(lab_of(_relit(fit_illumination(grouped, start).illumination, samples)))
         middle = [np.median(plain[samples.surface == k], axis=0) for k in range(len(own))]
         rough = TEXTURE_WEIGHT * patches.appearance[:, 3:]
         tree = linkage(np.concatenate([np.array(middle), rough], axis=1), "average")
@@ -162,7 +162,7 @@ def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
     return np.asarray(fcluster(tree, count, "maxclust") - 1)
 
 
-def _evenly(lab: Float[np.ndarray, "place 3"]) -> Float[np.ndarray, "place 3"]:
+def _perceptual(lab: Float[np.ndarray, "place 3"]) -> Float[np.ndarray, "place 3"]:
     """Return CIELAB with compressed chroma, so that distances of strong colours match perception.
 
     Lightness is multiplied by `LIGHTNESS_WEIGHT`.
@@ -192,7 +192,7 @@ def matched(
     samples = patches.samples
     fit = LitColours(Illumination.uniform(), np.concatenate([colours, _means(samples)]))
     for near in MATCH_LIMITS:
-        expected = _exposed(colours, fit.colours[: len(colours)], np.unique(own[own >= 0]))
+        expected = _to_brightness(colours, fit.colours[: len(colours)], np.unique(own[own >= 0]))
         own = _nearest(patches, fit.illumination.rgb_of(expected, samples.at), near)
         # a patch without a match counts as a surface of its own: it shows how the light changes
         each = np.where(own >= 0, own, len(colours) + np.arange(count))
@@ -200,7 +200,7 @@ def matched(
     return np.column_stack([patches.place, own])[own >= 0]
 
 
-def _exposed(
+def _to_brightness(
     given: Float[np.ndarray, "surface 3"],
     fitted: Float[np.ndarray, "surface 3"],
     matched: Int[np.ndarray, " match"],

@@ -56,7 +56,7 @@ class PictureMap:
     proposal: str | None
 
     def share(self, k: int) -> float:
-        """Return the fraction of the known floor that surface number `k` covers [1]."""
+        """Return the fraction of the known floor that the surface with index `k` covers [1]."""
         return float((self.labels == k).sum() / max(1, int((self.labels >= 0).sum())))
 
     def to_json(self) -> Content:

@@ -50,7 +50,7 @@ FIELD_ROUNDS = 5
 SMALL_PATCH = 150
 """Number of cells below which a patch is merged with its surroundings."""
 MARK_RADIUS = 4
-"""Distance around a marked point within which cells are taken to have its surface [cells]."""
+"""Distance around a marked point within which cells are assumed to have its surface [cells]."""
 
 
 MarkedCells = Int[np.ndarray, "cell 3"]

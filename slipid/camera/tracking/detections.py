@@ -24,7 +24,7 @@ CHECKPOINT_NAME = "sightings"
 KINDS = {"frame": int, "time": float, "repeated": bool, "row": int, "id": int, "corners": float}
 """Number type of each attribute of `Detections`."""
 FIRST_FRAMES = 100
-"""Number of frames after which a message lists the visible markers if none is a tracked one."""
+"""Number of frames without a tracked marker after which a message lists the visible markers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Detections:
 
     Attributes:
         frame, time: number and time [s] of every frame.
-        repeated: whether a frame's picture is identical to that of the frame before.
+        repeated: True if a frame's picture is identical to that of the frame before.
         row: frame of each detection, as an index into `frame`.
         id: number of the detected marker.
         corners: x, y of its corners in OpenCV's order [pixel].

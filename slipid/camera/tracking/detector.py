@@ -10,7 +10,7 @@ edges. Refining each corner by itself is inaccurate for a small marker: the wind
 contains the marker's inner pattern, which shifts all four corners in a way that looks like a
 rotation of the marker. An edge is visible over its whole length. Across it, from the black border
 to the white margin, brightness rises from one level to another, and the area below that profile
-gives the place of the edge, whatever the blur by the lens or by motion.
+gives the place of the edge for any blur by the lens or by motion.
 """
 
 from dataclasses import dataclass, field
@@ -35,10 +35,10 @@ ALONG, ACROSS = 20, 11
 END_SHARE = 0.12
 """Fraction of an edge's length that is not sampled at each end, near the next edge [1]."""
 SAMPLED_REACH = 0.6
-"""Distance up to which brightness is sampled on both sides of an edge, in squares of the marker
-[1]; beyond one square lies the inner pattern."""
+"""Distance to which brightness is sampled on both sides of an edge, in squares of the marker [1];
+beyond one square lies the inner pattern."""
 MOST_SAMPLED_REACH = 6.0
-"""Largest distance up to which brightness is sampled [pixel]; more would only add noise."""
+"""Largest distance to which brightness is sampled [pixel]; more would only add noise."""
 LEVEL_SAMPLES = 3
 """Number of outermost samples on each side whose median is the dark or the bright level."""
 LEAST_CONTRAST = 12.0
@@ -82,7 +82,7 @@ class Region:
 
     @property
     def empty(self) -> bool:
-        """Whether the region contains no pixel."""
+        """True if the region contains no pixel."""
         return self.right <= self.left or self.bottom <= self.top
 
 

@@ -164,7 +164,7 @@ def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
     except cv2.error:
         there = False
     if not there:
-        raise DataError(f"{path}: no picture that OpenCV writes; expected .png or .jpg")
+        raise DataError(f"{path}: not a picture that OpenCV writes; expected .png or .jpg")
     return bytes(data)
 
 
@@ -206,7 +206,7 @@ def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
 def _label(
     drawn: np.ndarray, camera: OverheadCamera, place: Float[np.ndarray, "3"], text: str
 ) -> None:
-    """Write text beside a place on the floor [m], if the place lies in the picture."""
+    """Write text next to a place on the floor [m], if the place lies in the picture."""
     x, y = camera.pixels(place[None])[0].tolist()
     width, height = camera.lens.image_px
     if 0 <= x < width and 0 <= y < height:

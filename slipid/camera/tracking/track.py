@@ -193,7 +193,7 @@ ODD_SQUARES = 25.0
 """Mean squared residual of a frame, relative to the median over frames, above which its corners do
 not have the shape of a marker [1]."""
 ODD_LEAST = 1.0
-"""Root mean square residual of a frame below which its corners are accepted whatever the median is
+"""Root mean square residual of a frame below which its corners are accepted for any median
 [pixel]. Residuals vary with heading, since an edge along the pixels' rows is located better than a
 slanted one."""
 ODD_SIZE = 0.05
@@ -298,7 +298,7 @@ def track_of(camera: OverheadCamera, target: Target, detections: Detections) -> 
     flag = np.where(twice, Flag.AMBIGUOUS, np.where(present, Flag.OK, Flag.MISSING))
     flag[detections.repeated] = Flag.REPEATED
     mean_square = fit.squares / np.maximum(fit.free, 1.0)
-    flag[_odd(mean_square, fit.size, present) & (flag == Flag.OK)] = Flag.SHAPE
+    flag[_odd_shapes(mean_square, fit.size, present) & (flag == Flag.OK)] = Flag.SHAPE
     squares = mean_square[flag == Flag.OK]
     noise = max(LEAST_CORNER_STD, float(np.sqrt(squares.sum() / max(len(squares), 1))))
     corners_used = 0.5 * (fit.free + 4.0)
@@ -325,7 +325,7 @@ def track_of(camera: OverheadCamera, target: Target, detections: Detections) -> 
     )
 
 
-def _odd(
+def _odd_shapes(
     mean_square: Float[np.ndarray, " frame"],
     size: Float[np.ndarray, " frame"],
     present: Bool[np.ndarray, " frame"],

@@ -60,7 +60,7 @@ class TrackingResult:
         return names
 
     def to_json(self) -> Content:
-        """Return a summary of the results for programs; the poses are in files of their own."""
+        """Return a summary of the results for programs; the poses are in separate files."""
         return {
             "schema": SCHEMA,
             "source": self.source.name,

@@ -1,12 +1,12 @@
 """Clock offset and drift between a run's poses and its robot, estimated from the motion itself.
 
-A camera and a robot that were started by hand have clocks of their own. The increments of the pose
-are regressed on the turns of the wheels, or of the gyro (see `regression`), at the time
+A camera and a robot that were started separately have independent clocks. The increments of the
+pose are regressed on the rotation of the wheels, or of the gyro (see `regression`), at the time
 
     s = t + offset + drift (t - middle)
 
-where t is the time of a pose on its own clock and s the time on the robot's clock. The noise
-variances are estimated from the residuals, the stds of offset and drift from the disagreement
+where t is the time of a pose on the clock of the poses and s the time on the robot's clock. The
+noise variances are estimated from the residuals, the stds of offset and drift from the disagreement
 between blocks of the run.
 """
 
@@ -28,27 +28,27 @@ from slipid.data.align.regression import (
     unexplained,
 )
 
-COARSE, SEARCHED = 0.05, 0.1
+COARSE_GRID_S, COARSE_STEP_S = 0.05, 0.1
 """Grid spacing of the first search for the offset, and shortest duration of the pose increments
 that it compares [s]."""
-FINE, REACH = 0.01, 0.2
+FINE_GRID_S, FINE_HALF_WIDTH_S = 0.01, 0.2
 """Grid spacing and half width of the second search, which has a noise model, around the offset that
 the first search found [s]."""
-LEAST_SHARED = 1.0
-"""Least time that both records must have in common at a searched offset [s]."""
-DRIFT_STD, OTHER_RATE = 1e-4, 1e-2
+LEAST_OVERLAP_S = 1.0
+"""Shortest overlap of both records at the offsets that are searched [s]."""
+DRIFT_STD, WIDE_DRIFT_STD = 1e-4, 1e-2
 """Prior stds of the drift [1]: the first is larger than the error of any quartz clock; the second
 replaces it if the motion contradicts it, for example because the declared frame rate is wrong."""
 BLOCKS = 10
 """Number of blocks of a run whose disagreement gives the stds of offset and drift."""
-ROUNDS, SETTLED = 20, 6
+MOST_ITERATIONS, NOISE_ITERATIONS = 20, 6
 """Largest number of Gauss-Newton iterations, and number of the first ones that re-estimate the
 noise."""
-MOST_LEFT = 0.5
+MOST_UNEXPLAINED = 0.5
 """Largest share of the motion that the regression at the best offset may leave unexplained [1]."""
-GOOD_STD = 0.03
+LARGEST_STD_S = 0.03
 """Std above which an offset is discarded [s]."""
-SURE_STD = 0.005
+SUFFICIENT_STD_S = 0.005
 """Std below which an offset is accepted without evaluating further motion pairs of the run [s]."""
 
 
@@ -86,15 +86,15 @@ class Clock:
 
 
 def best_clock(pairs: Iterable[MotionPair]) -> Clock | None:
-    """Return the clock of a run's poses from the first motion pair whose offset std is `SURE_STD`.
+    """Return the clock of a run's poses from the first motion pair with a sufficient offset std.
 
-    Later pairs are not evaluated. If no pair reaches that std, the clock with the smallest std is
-    returned, or None if no pair determines a clock.
+    The std must be at most `SUFFICIENT_STD_S`; later pairs are not evaluated. If no pair reaches
+    this std, the clock with the smallest std is returned, or None if no pair determines a clock.
     """
     found = []
     for pair in pairs:
         clock = clock_of_poses(pair)
-        if clock is not None and clock.offset_std <= SURE_STD:
+        if clock is not None and clock.offset_std <= SUFFICIENT_STD_S:
             return clock
         found += [] if clock is None else [clock]
     return min(found, key=lambda clock: clock.offset_std, default=None)
@@ -113,14 +113,14 @@ def clock_of_poses(pair: MotionPair) -> Clock | None:
 
 def _searched(pair: MotionPair) -> float | None:
     """Return the offset that explains the motion best, or None if it is not clearly the best."""
-    low = pair.time[0] + LEAST_SHARED - pair.pose_time[-1]
-    high = pair.time[-1] - LEAST_SHARED - pair.pose_time[0]
+    low = pair.time[0] + LEAST_OVERLAP_S - pair.pose_time[-1]
+    high = pair.time[-1] - LEAST_OVERLAP_S - pair.pose_time[0]
     if not high > low:
         return None
-    offsets = np.arange(low, high + COARSE, COARSE)
-    rest = unexplained([pair], offsets, SEARCHED)
+    offsets = np.arange(low, high + COARSE_GRID_S, COARSE_GRID_S)
+    rest = unexplained([pair], offsets, COARSE_STEP_S)
     best = clear_best(offsets, rest)
-    return None if best is None or not rest[best] < MOST_LEFT else float(offsets[best])
+    return None if best is None or not rest[best] < MOST_UNEXPLAINED else float(offsets[best])
 
 
 def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | None:
@@ -130,7 +130,7 @@ def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | 
     or leave the searched range around the given offset [s].
     """
     middle = 0.5 * float(steps.first[0] + steps.last[-1])
-    grid = offset + np.arange(-REACH, REACH + FINE, FINE)
+    grid = offset + np.arange(-FINE_HALF_WIDTH_S, FINE_HALF_WIDTH_S + FINE_GRID_S, FINE_GRID_S)
     at, noise = np.array([offset, 0.0]), tuple(StepNoise(0.0, 1.0) for _ in pair.components)
     for _ in range(2):  # the second search whitens with the noise estimated in the first
         every = [linearised(pair, steps, np.array([o, 0.0]), middle, noise) for o in grid]
@@ -140,11 +140,11 @@ def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | 
         _, k, noise = min(fits)
         at[0] = grid[k]
     quartz, change = True, np.full(2, np.inf)
-    for k in range(ROUNDS):
+    for k in range(MOST_ITERATIONS):
         now = linearised(pair, steps, at, middle, noise)
-        if now is None or abs(at[0] - offset) > REACH:
+        if now is None or abs(at[0] - offset) > FINE_HALF_WIDTH_S:
             return None
-        prior = np.diag([0.0, (DRIFT_STD if quartz else OTHER_RATE) ** -2])
+        prior = np.diag([0.0, (DRIFT_STD if quartz else WIDE_DRIFT_STD) ** -2])
         normal = np.einsum("kci,kcj->ij", now.slope, now.slope) + prior
         if not normal[0, 0] > 0.0:
             return None
@@ -155,8 +155,8 @@ def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | 
             return _clock(pair, now, at, np.linalg.inv(normal), middle)
         gradient = np.einsum("kci,kc->i", now.slope, now.residual) + prior @ at
         change = np.linalg.solve(normal, gradient)
-        at = at - np.clip(change, -COARSE, COARSE)
-        noise = now.noise if k < SETTLED else noise
+        at = at - np.clip(change, -COARSE_GRID_S, COARSE_GRID_S)
+        noise = now.noise if k < NOISE_ITERATIONS else noise
     return None
 
 
@@ -167,10 +167,10 @@ def _clock(
     inverse: Float[np.ndarray, "2 2"],
     middle: float,
 ) -> Clock | None:
-    """Return the clock at an optimum, or None if the std of its offset is above `GOOD_STD`."""
+    """Return the clock at an optimum, or None if the std of its offset is above `LARGEST_STD_S`."""
     std = _spread(near, inverse)
     std[0] = np.hypot(std[0], pair.body_std)
-    if not std[0] < GOOD_STD:
+    if not std[0] < LARGEST_STD_S:
         return None
     return Clock(
         offset=float(at[0]),

@@ -8,18 +8,18 @@ import numpy as np
 from slipid.data.align.regression import MotionPair, clear_best, unexplained
 from slipid.data.runs import Runs
 
-LONGEST, SHARED = 8.0, 0.3
+LONGEST_LAG_S, LEAST_OVERLAP = 8.0, 0.3
 """Largest searched lag of either sign [s], and share of a median run in which poses and encoders
 must still overlap [1]."""
-COARSE, FINE = 0.1, 0.01
+COARSE_GRID_S, FINE_GRID_S = 0.1, 0.01
 """Grid spacings of the first and of the second search [s]."""
-STEP = 0.2
+STEP_S = 0.2
 """Shortest duration of the compared pose increments [s]."""
 MOST_RUNS = 40
 """Largest number of compared runs, which are picked evenly from all runs."""
-GAIN, DROP = 0.75, 0.02
-"""A lag is decisive if the share of the motion that it leaves unexplained is below `GAIN` times the
-share at zero lag, and lower than that by more than `DROP` [1]."""
+DECISIVE_RATIO, DECISIVE_DROP = 0.75, 0.02
+"""A lag is decisive if the share of the motion that it leaves unexplained is below `DECISIVE_RATIO`
+times the share at zero lag, and lower than that by more than `DECISIVE_DROP` [1]."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class PoseLag:
     def decisive(self) -> bool:
         """True if poses and wheels agree clearly better at this lag than at zero lag."""
         drop = self.unexplained_at_zero - self.unexplained
-        return self.unexplained < GAIN * self.unexplained_at_zero and drop > DROP
+        return self.unexplained < DECISIVE_RATIO * self.unexplained_at_zero and drop > DECISIVE_DROP
 
 
-_FOUND: WeakKeyDictionary[Runs, PoseLag | None] = WeakKeyDictionary()
+_CACHE: WeakKeyDictionary[Runs, PoseLag | None] = WeakKeyDictionary()
 
 
 def pose_lag(data: Runs) -> PoseLag | None:
@@ -51,9 +51,9 @@ def pose_lag(data: Runs) -> PoseLag | None:
 
     The result is kept for each set of runs, because both the check and the start of a fit use it.
     """
-    if data not in _FOUND:
-        _FOUND[data] = _searched(data)
-    return _FOUND[data]
+    if data not in _CACHE:
+        _CACHE[data] = _searched(data)
+    return _CACHE[data]
 
 
 def _searched(data: Runs) -> PoseLag | None:
@@ -63,20 +63,20 @@ def _searched(data: Runs) -> PoseLag | None:
     if not pairs:
         return None
     usual = float(np.median([pair.time[-1] - pair.time[0] for pair in pairs]))
-    most = round(min(LONGEST, (1.0 - SHARED) * usual) / COARSE)
-    coarse = COARSE * np.arange(-most, most + 1)
-    rest = unexplained(pairs, -coarse, STEP)
+    most = round(min(LONGEST_LAG_S, (1.0 - LEAST_OVERLAP) * usual) / COARSE_GRID_S)
+    coarse = COARSE_GRID_S * np.arange(-most, most + 1)
+    rest = unexplained(pairs, -coarse, STEP_S)
     best = clear_best(coarse, rest)
     if best is None or best in (0, len(coarse) - 1):
         return None
-    fine = coarse[best] + np.arange(-COARSE, COARSE + FINE / 2, FINE)
-    near = unexplained(pairs, -np.append(fine, 0.0), STEP)
+    fine = coarse[best] + np.arange(-COARSE_GRID_S, COARSE_GRID_S + FINE_GRID_S / 2, FINE_GRID_S)
+    near = unexplained(pairs, -np.append(fine, 0.0), STEP_S)
     k = int(np.argmin(near[:-1]))
     return PoseLag(float(fine[k]), float(near[k]), float(near[-1]))
 
 
 def _pair(data: Runs, run: int) -> MotionPair:
-    """Return the wheel angles and poses of one run, whose record may begin and end in motion."""
+    """Return the motion pair of one run, extrapolated beyond the ends of its record."""
     rows = data.rows(run)
     time, fresh = data.time[rows], data.fresh[rows]
     return MotionPair(
@@ -85,7 +85,7 @@ def _pair(data: Runs, run: int) -> MotionPair:
         time[fresh],
         data.pose[rows][fresh],
         source="wheels",
-        step=STEP,
+        step=STEP_S,
         collinear=1e-9,
         goes_on=True,
     )

@@ -1,14 +1,14 @@
-"""Regression of pose increments on the turns of wheels or gyro, as a function of a time offset.
+"""Regression of pose increments on the rotation of wheels or gyro, as a function of a time offset.
 
     moved_k = B (turned(last_k + offset) - turned(first_k + offset)) + e_k
 
 where moved_k is the pose increment over step k, from first_k to last_k [s], turned are the angles
 of the wheels or of the gyro, B is the fitted matrix and e_k the noise. Sizes, signs and order of
-the wheels need not be known, since B absorbs them. The motion must change its speed, because steady
-motion looks the same at any offset. A search compares offsets by the unexplained share of the
-motion; near the best offset, `linearised` gives the derivatives by offset and drift under a noise
-model, in which e is the sum of pose noise, which successive steps share, and of slip, which is
-independent in each step.
+the wheels need not be known, since B absorbs them. The speed must change during the motion, because
+steady motion looks the same at any offset. A search compares offsets by the unexplained share of
+the motion; near the best offset, `linearised` gives the derivatives by offset and drift under a
+noise model, in which e is the sum of pose noise, which successive steps share, and of slip, which
+is independent in each step.
 """
 
 from collections.abc import Sequence
@@ -53,8 +53,8 @@ class MotionPair:
             on a straight path, where the turns of all wheels are proportional.
         body_std: std of the delay between the body and `turned` [s].
         components: indices of the compared components: 0 ahead, 1 left, 2 heading.
-        goes_on: True if the motion is extrapolated beyond the record at the rates at its ends, else
-            it stops there.
+        goes_on: True to extrapolate the motion beyond the ends of the record at the rates there;
+            False to assume standstill there.
     """
 
     time: Float[np.ndarray, " row"]
@@ -145,10 +145,10 @@ LEAST_STEPS = 20
 """Least number of steps for a fit of offset and drift."""
 LEAST_PER_COLUMN = 3
 """Least number of steps per column of `turned` for the regression at a searched offset."""
-ELSEWHERE, BETTER = 0.5, 0.02
+DISTANT_S, CLEAR_MARGIN = 0.5, 0.02
 """The best offset is clear if the unexplained share of the motion at every offset further than
-`ELSEWHERE` [s] from it is larger by at least `BETTER` [1]; steady or periodic motion has no clear
-best offset."""
+`DISTANT_S` [s] from it is larger by at least `CLEAR_MARGIN` [1]; steady or periodic motion has no
+clear best offset."""
 
 
 def unexplained(
@@ -157,8 +157,8 @@ def unexplained(
     """Return, for each offset [s], the share of the motion that one B for all pairs cannot explain.
 
     It is the geometric mean of the unexplained shares of the components, which ranks offsets as the
-    profile likelihood does if each component has a noise variance of its own. Therefore units do
-    not matter, and a component that nothing explains, such as the sideways motion of a robot with
+    profile likelihood does if each component has a separate noise variance. Therefore units do not
+    matter, and a component that cannot be explained, such as the sideways motion of a robot with
     two wheels, does not hide the others.
 
     Args:
@@ -190,13 +190,13 @@ def unexplained(
 def clear_best(
     offsets: Float[np.ndarray, " offset"], rest: Float[np.ndarray, " offset"]
 ) -> int | None:
-    """Return the index of the best offset, or None if a distant offset is about as good.
+    """Return the index of the best offset, or None if a distant offset is nearly as good.
 
     `rest` is the unexplained share of the motion at each offset [1].
     """
     best = int(np.argmin(rest))
-    others = rest[np.abs(offsets - offsets[best]) > ELSEWHERE]
-    return best if others.min(initial=np.inf) > rest[best] + BETTER else None
+    others = rest[np.abs(offsets - offsets[best]) > DISTANT_S]
+    return best if others.min(initial=np.inf) > rest[best] + CLEAR_MARGIN else None
 
 
 @dataclass(frozen=True, eq=False)

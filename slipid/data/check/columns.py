@@ -1,7 +1,7 @@
-"""Findings about the columns of the wheels' channels: wheel speeds, currents and voltages.
+"""Findings about the columns of wheel speeds, currents and voltages.
 
-The columns of commanded or reported speeds may be in another order than those of the encoders; one
-run is enough to find that. The channels of commanded and of reported speeds may be exchanged: a
+The columns of commanded or reported speeds may be in another order than those of the encoders; this
+can be found from a single run. The channels of commanded and of reported speeds may be exchanged: a
 command precedes the motion and is constant between its changes. If they are exchanged, the channel
 declared as the command changes later than the one declared as the measured speed, and in more rows.
 The sign and order of currents and voltages are found from the work of the motors, their units from
@@ -22,10 +22,11 @@ from slipid.data.wheel_signals import integral, interpolate, swapped_order
 from slipid.support.errors import DataError
 
 MADE_REDUNDANT_BY = ("wheel_sign", "wheel_order", "command_sign", "command_order")
-"""Kinds of findings, from the poses of all runs, that make a `wheel_columns` finding redundant."""
+"""Kinds of findings from poses that make a `wheel_columns` finding redundant."""
 CAUSED_BY_ORDER = ("wheel_scale", "wheel_speed_unit")
-"""Kinds of findings that a wrong order of columns may cause. They are left out where there is a
-`wheel_columns` finding; a check after its remedy reports them if they were real."""
+"""Kinds of findings that may only be consequences of a wrong order of columns. They are left out if
+there is a `wheel_columns` finding; once its remedy is applied, the next check reports them if they
+are real."""
 STEP_S = 0.5
 """Duration of the steps in which channels are compared with encoders [s]; delays and jitter are
 small compared with it."""
@@ -34,7 +35,7 @@ SPEED_CHANNELS = ("wheel_speed_command", "wheel_speed")
 LONGEST_LAG_S = 1.0
 """Largest searched lag of either sign between command and measured speed [s]."""
 MOST_SHIFTS = 50
-"""Largest searched lag in rows; it limits the search where time is in a wrong unit."""
+"""Largest searched lag in rows; it limits the search if time is in a wrong unit."""
 MOST_ROWS = 20_000
 """Largest number of rows in which command and measured speed are compared."""
 LEAST_CORRELATION = 0.3
@@ -57,10 +58,10 @@ def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
         listed = ", ".join(map(str, order))
         yield Finding(
             "wheel_columns",
-            f"the wheels match their {name} only with their columns in the order "
-            f"{listed}, where those below zero count backwards",
-            f"list the columns of the wheels, or those of {name}, in another order, or set "
-            "scale = -1 for those that count backwards",
+            f"the columns of the wheels match those of {name} only in the order {listed} (a "
+            "negative number is a column with the opposite sign)",
+            f"list the columns of the wheels, or those of {name}, in this order, and set scale = "
+            "-1 for columns with the opposite sign",
             runs=() if len(names) == len(logs) else tuple(names),
         )
 
@@ -68,7 +69,7 @@ def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
 def refuse_misordered(logs: Sequence[Log]) -> None:
     """Raise `DataError` with all findings of `misordered`.
 
-    It is for commands that do not run the whole check.
+    Used by commands that do not run the whole check.
     """
     if listed := "\n".join(f"not used: {finding}" for finding in misordered(logs)):
         raise DataError(listed)
@@ -114,9 +115,9 @@ def exchanged(data: JoinedRuns) -> Iterator[Finding]:
     ):
         yield Finding(
             "command_exchanged",
-            f"what is called the commanded wheel speed comes {-shifts[best] * row:.2g} s after the "
-            f"measured one, and changes in {busy[0]:.0%} of the rows, the measured one in "
-            f"{busy[1]:.0%}",
+            "the channel declared as the commanded wheel speed lags the measured one by "
+            f"{-shifts[best] * row:.2g} s, and changes in {busy[0]:.0%} of the rows, the measured "
+            f"one in {busy[1]:.0%}",
             "exchange the columns of wheel_speed_command and wheel_speed (or of "
             "motor_speed_command and motor_speed)",
         )
@@ -134,7 +135,7 @@ def _changes(
         channel: integral of the wheel speed [rad].
         when: times of the rows [s].
         row: time between rows [s].
-        inside: whether the time from each row to the next lies within one run.
+        inside: True if the time from each row to the next lies within one run.
     """
     speed = (channel.at(when + row) - channel.at(when)) / row
     speed[~inside] = np.nan
@@ -142,9 +143,9 @@ def _changes(
 
 
 def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
-    """Return the correlation of the changes of a command with those of the speed `shift` later.
+    """Return the correlation of changes of a command and of the speed `shift` rows later.
 
-    `shift` is a number of rows of either sign.
+    `shift` may be negative.
     """
     n = len(command) - abs(shift)
     first, second = (command[:n], speed[-n:]) if shift >= 0 else (command[-n:], speed[:n])
@@ -161,19 +162,19 @@ SHARE_OF_POWER = 0.1
 """A current has the sign of the power, not of the torque, if its share of work is above this while
 wheels turn forwards and below its negative while they turn backwards [1]."""
 MOST_A_PER_KG = 2.5
-"""Slope of the largest plausible current of one motor, `MOST_A + MOST_A_PER_KG * mass` [A/kg]; no
-wheeled robot draws that much continuously."""
+"""Slope of the largest plausible current of one motor, `MOST_A + MOST_A_PER_KG * mass` [A/kg];
+wheeled robots do not draw more continuously."""
 MOST_A = 8.0
 """Constant part of the largest plausible current of one motor [A]."""
-MOST_UNWEIGHED_A = 200.0
+MOST_A_WITHOUT_MASS = 200.0
 """Largest plausible current of one motor if the robot's mass is unknown [A]."""
 LEAST_A = 0.005
 """Current of a driving motor below which its unit must be wrong [A]."""
 MOST_V, LEAST_V = 200.0, 0.2
 """Largest and smallest plausible voltages of the motors of such robots [V]."""
 PLAUSIBLE_POWER = (0.003, 60.0)
-"""Plausible range of the electrical power over weight times speed, P / (m g v) [1]; every robot
-that rolls or climbs lies in it."""
+"""Plausible range of the electrical power over weight times speed, P / (m g v) [1], for robots on
+any slope and surface."""
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 
@@ -188,7 +189,7 @@ def electric(
         meant: the right order and signs of the wheels.
         radius: radius of the wheels [m].
         mass_kg: mass of the robot [kg], or None if it is unknown.
-        by_power: whether no scale is wrong, so that the power can be compared with the speed.
+        by_power: True if no scale is wrong, so that the power can be compared with the speed.
     """
     declared = _speeds(data)
     speed = declared @ columns(meant, data.wheels).T
@@ -205,7 +206,7 @@ def electric(
         watts = float(np.nanmean((current * voltage).sum(axis=1)))
         rim = float(np.nanmean(np.abs(speed[driving]).mean(axis=1))) * radius
         power = watts / max(mass_kg * GRAVITY * rim, 1e-9)
-    most = MOST_UNWEIGHED_A if mass_kg is None else MOST_A + MOST_A_PER_KG * mass_kg
+    most = MOST_A_WITHOUT_MASS if mass_kg is None else MOST_A + MOST_A_PER_KG * mass_kg
     sizes = [
         *_size(voltage, "voltage", "V", LEAST_V, MOST_V, "voltage or bus_voltage"),
         *_size(current, "current", "A", LEAST_A, most, "current"),
@@ -236,7 +237,8 @@ def _sign_findings(
 ) -> Iterator[Finding]:
     """Yield findings about the signs and order of currents or voltages.
 
-    Over a drive a motor does positive work on its wheel, so the sum of value x speed is positive.
+    Over a whole run a motor does positive work on its wheel, so the sum of value x speed is
+    positive.
 
     Args:
         values: currents [A] or voltages [V].
@@ -250,10 +252,10 @@ def _sign_findings(
         both = "currents are positive in both directions of the wheels"
         if np.nanmin(values) < 0.0:
             found = (
-                f"{both}, and negative at times: they are currents of the supply, with the sign of "
-                "the power, not of the torque"
+                f"{both}, and sometimes negative: they are supply currents, which have the sign "
+                "of the power, not of the torque"
             )
-            remedy = "take the current out of the layout, or log that of each motor"
+            remedy = "remove the current from the layout, or log the current of each motor"
         else:
             found = f"{both}: they are magnitudes, which do not distinguish driving from braking"
             remedy = "set current_is_signed = false in the layout"
@@ -276,8 +278,8 @@ def _sign_findings(
     which = "every wheel" if every else "wheel " + " and ".join(str(k + 1) for k in turned)
     yield Finding(
         f"{name}_sign",
-        f"the {name} of {which} brakes where the motor should drive: its product with the wheel's "
-        f"speed sums to {share[turned].min():+.2f} of its magnitude",
+        f"the {name} of {which} has the wrong sign: its product with the wheel speed, which "
+        f"should be mostly positive, sums to {share[turned].min():+.2f} of its magnitude",
         f"set scale = -1 for {'the channel' if every else 'its column of the channel'} {name}, "
         "if it is 1 (else turn its sign)",
     )
@@ -290,8 +292,8 @@ def _other_order(
 ) -> tuple[int, ...] | None:
     """Return the column of each wheel if another order explains more than other signs, else None.
 
-    An order of the columns that matches the encoders' as declared is no finding: if that order is
-    wrong, the finding is about the encoders.
+    If the columns match the declared order of the encoders, there is no finding here: if that order
+    is wrong, the finding is about the encoders.
     """
     share, as_declared = (
         _share(np.nan_to_num(values[:, None] * one[:, :, None])) for one in (speed, declared)
@@ -333,7 +335,7 @@ def _size(
     right, scale = (f"m{unit}", "0.001") if usual > high else (unit, "1000")
     yield Finding(
         f"{name}_unit",
-        f"the {name} of driving motors reaches {usual:.4g} {unit}; plausible are {low:g} to "
-        f"{high:.3g} {unit} for such a robot",
+        f"the {name} of driving motors reaches {usual:.4g} {unit}; plausible for such a robot: "
+        f"{low:g} to {high:.3g} {unit}",
         f"set unit = '{right}' for the channel {channel} (scale = {scale})",
     )

@@ -1,6 +1,6 @@
 """Findings of the check, and their texts.
 
-A finding says what is wrong or could not be checked, and which key of the config to change.
+A finding describes what is wrong or could not be checked, and which key of the config to change.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,8 +14,8 @@ from slipid.data.check.ratios import QUANTITIES, ScaleCause, ScaleRatio
 from slipid.support.content import Content
 
 Severity = Literal["wrong", "suspicious", "note"]
-"""Severity of a finding: `wrong` must be corrected before a fit, `suspicious` may be right but
-should be looked at, `note` is about what could not be checked."""
+"""Severity of a finding: `wrong` must be corrected before a fit, `suspicious` may be correct but
+should be examined, `note` reports what could not be checked."""
 SEVERITIES: tuple[Severity, ...] = ("wrong", "suspicious", "note")
 MOST_NAMED_RUNS = 4
 """Largest number of runs that a sentence names; the others are only counted."""
@@ -27,8 +27,8 @@ class Finding:
 
     Attributes:
         kind: name of the kind of finding, such as `wheel_sign`; module `sanity` lists all kinds.
-        found: text that says what is wrong, with numbers.
-        remedy: text that says which key to change, and to what; or None.
+        found: description of what is wrong, with numbers.
+        remedy: the key to change and its new value, as a sentence; or None.
         severity: severity of the finding.
         runs: names of the runs concerned; empty if all are.
     """
@@ -48,13 +48,14 @@ class Finding:
 
         Args:
             how: evidence, which follows the text of the finding.
-            others: findings that explain the logs as well, whose remedies are added.
+            others: alternative findings that explain the logs equally well, whose remedies are
+                added.
         """
-        more = "".join(f"; or, which explains these logs as well: {o.remedy}" for o in others)
+        more = "".join(f"; or, which explains these logs equally well: {o.remedy}" for o in others)
         return replace(self, found=f"{self.found}: {how}", remedy=f"{self.remedy}{more}")
 
     def to_json(self) -> Content:
-        """Return the finding in the form in which `check.json` has it."""
+        """Return the finding as an object of check.json."""
         return asdict(self) | {"runs": list(self.runs)}
 
 
@@ -65,7 +66,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return the findings, those that forbid a fit first."""
+    """Return the findings in order of severity, those that forbid a fit first."""
     return tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity)))
 
 
@@ -78,7 +79,7 @@ _CONVENTION_SENTENCES = {
     "heading_sign": "the heading of the poses turns in the opposite direction of the body",
     "pose_axis": "an axis of the poses has the wrong sign",
     "pose_swapped": "x and y of the poses are exchanged",
-    "pose_mirrored": "the poses are mirrored, as from below or in an image whose y points down",
+    "pose_mirrored": "the poses are mirrored, as if seen from below or with y pointing down",
     "heading_quaternion": "the heading is the z of a quaternion, sin(yaw / 2), not an angle",
 }
 
@@ -86,8 +87,8 @@ _CONVENTION_SENTENCES = {
 def mistake_finding(mistake: Mistake) -> Finding:
     """Return the finding about a mistake in order, signs or axes, with at most two alternatives."""
     how = (
-        f"with this correction {mistake.after:.2f} of the motion is unexplained, "
-        f"as declared {mistake.before:.2f}"
+        f"with this correction {mistake.after:.2f} of the motion remains unexplained, as declared "
+        f"{mistake.before:.2f}"
     )
     return _candidate_finding(mistake.found).explained(
         how, map(_candidate_finding, mistake.others[:2])
@@ -105,7 +106,7 @@ def _candidate_finding(candidate: Candidate) -> Finding:
         axes = [a for a, s in zip(("x", "y", "yaw"), meant.twist_sign, strict=True) if s < 0]
         found = f"the commanded twist has the wrong sign in {' and '.join(axes)}"
         channels = " and ".join(f"the channel twist_command_{axis}" for axis in axes)
-        return Finding(kind, found, f"turn the sign of scale for {channels}")
+        return Finding(kind, found, f"reverse the sign of scale for {channels}")
     if kind == "wheel_order":
         return _order_finding(kind, meant.order, "the wheels' columns")
     if kind == "command_order":
@@ -119,7 +120,7 @@ def _candidate_finding(candidate: Candidate) -> Finding:
             "drive_directions_deg) in [robot]",
         )
     if kind == "gyro_sign":
-        remedy = "turn the sign of scale for the channel gyro"
+        remedy = "reverse the sign of scale for the channel gyro"
         return Finding(kind, "the gyro turns in the opposite direction of the poses", remedy)
     return _convention_finding(kind, meant.convention)
 
@@ -127,7 +128,7 @@ def _candidate_finding(candidate: Candidate) -> Finding:
 def _sign_finding(kind: str, sign: Sequence[int], commanded: str) -> Finding:
     """Return the finding about wheels whose turns or commanded turns have the wrong sign.
 
-    `commanded` is a word before "turns": "commanded ", or an empty text.
+    `commanded` is the text before the word "rotation" in the finding: "commanded ", or empty.
     """
     turned = [str(k + 1) for k, s in enumerate(sign) if s < 0]
     wheels = f"wheel{'s' if len(turned) > 1 else ''} {' and '.join(turned)}"
@@ -136,9 +137,9 @@ def _sign_finding(kind: str, sign: Sequence[int], commanded: str) -> Finding:
         wheels, column = "every wheel", "the channel of the wheels"
     return Finding(
         kind,
-        f"the {commanded}turns of {wheels} have the opposite sign of the motion",
-        f"set scale = -1 for {column}{' in the commanded speeds' if commanded else ''}, "
-        "if it is 1 (else turn its sign)",
+        f"the {commanded}rotation of {wheels} has the opposite sign of the motion",
+        f"set scale = -1 for {column}{' in the commanded speeds' if commanded else ''}, if it is "
+        "1 (else reverse its sign)",
     )
 
 
@@ -148,7 +149,7 @@ def _order_finding(kind: str, order: Sequence[int], columns: str) -> Finding:
     return Finding(
         kind,
         f"{columns} are in another order than the wheels of [robot]",
-        f"list the columns in the order {listed} (counted as they are listed now)",
+        f"list the columns in the order {listed} (numbers of their present places)",
     )
 
 
@@ -157,7 +158,7 @@ def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
     turn = convention.offset
     offset = f" and add {turn} deg to its offset" if turn else ""
     if kind == "heading_offset":
-        found = f"the heading of the poses is turned by {-turn} deg against the body"
+        found = f"the heading of the poses is rotated by {-turn} deg relative to the body"
         return Finding(kind, found, f"add {turn} deg to the offset of the channel pose_heading")
     if kind == "heading_unit":
         unit, other = ("deg", "rad") if convention.heading == "degrees" else ("rad", "deg")
@@ -166,12 +167,12 @@ def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
     remedy = {
         "heading_quaternion": "log the yaw, 2 atan2(qz, qw), and name its column in the channel "
         "pose_heading",
-        "heading_sign": f"turn the sign of scale for the channel pose_heading{offset}",
+        "heading_sign": f"reverse the sign of scale for the channel pose_heading{offset}",
         "pose_axis": "turn the sign of scale for the channel pose_"
         + ("x" if abs(turn) == 180 else "y"),
         "pose_swapped": "exchange the columns of the channels pose_x and pose_y",
-        "pose_mirrored": "turn the sign of scale for the channels pose_y and pose_heading (or of "
-        f"pose_x and pose_heading, with 180 deg more in its offset){offset}",
+        "pose_mirrored": "reverse the sign of scale for pose_y and pose_heading (or for pose_x and "
+        f"pose_heading, with 180 deg added to the offset){offset}",
     }[kind]
     return Finding(kind, _CONVENTION_SENTENCES[kind], remedy)
 
@@ -186,7 +187,7 @@ def cause_findings(
 
     Args:
         fitting: causes that fit, the likeliest first.
-        single: whether each of these causes fits alone.
+        single: True if each of these causes fits alone.
         scales: ratios by name.
         gear_ratio: gear ratio of the declared robot.
     """
@@ -194,8 +195,8 @@ def cause_findings(
     if not fitting:
         found = Finding(
             "scales",
-            "the channels disagree about the robot's path length, and no single number explains "
-            f"it: {why}",
+            "the channels disagree about the motion, and no single wrong number explains it: "
+            f"{why}",
             "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
         )
         return (found,) if why else ()
@@ -214,12 +215,12 @@ def ratio_sentence(known: Mapping[str, ScaleRatio]) -> str:
     """Return a sentence with the value of every ratio that is outside its range."""
     sentences = {
         "travel": "the body's path length is {:.3g} times that of the wheels",
-        "turning": "the body turns {:.3g} times as much as the wheels",
+        "turning": "the rotation of the body is {:.3g} times that computed from the wheels",
         "drive": "the commanded motion is {:.3g} times that of the wheels",
-        "steer": "the commanded turn is {:.3g} times that of the wheels",
+        "steer": "the commanded rotation is {:.3g} times that of the wheels",
         "command": "the commanded wheel speeds are {:.3g} times the measured ones",
         "report": "the reported wheel speeds are {:.3g} times those of the encoders",
-        "gyro": "the gyro turns {:.3g} times as much as the poses",
+        "gyro": "the rotation measured by the gyro is {:.3g} times that of the poses",
     }
     return ", ".join(sentences[k].format(r.value) for k, r in known.items() if not r.natural)
 
@@ -241,7 +242,7 @@ def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
     elif cause.name == "heading":
         remedy = f"set unit = '{'deg' if factor > 1 else 'rad'}' for the channel pose_heading"
     elif cause.name == "wheel_radius":
-        found = f"wheel_radius_m is {size}, or the wheels' turns are"
+        found = f"wheel_radius_m is {size}, or the rotation of the wheels is"
         remedy = (
             f"divide wheel_radius_m in [robot] by {factor:.3g}, or {_turns(factor, gear_ratio)}"
         )
@@ -262,7 +263,7 @@ def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
 
 
 def _turns(factor: float, gear_ratio: float) -> str:
-    """Return the remedy for turns of the wheels that are too large by a factor."""
+    """Return the remedy for a logged rotation of the wheels that is too large by a factor."""
     remedies = [f"multiply ticks_per_revolution or the layout's gear_ratio by {factor:.3g}"]
     if gear_ratio > 1.5 and isclose(1 / factor, gear_ratio, rel_tol=0.02):
         remedies = [

@@ -4,10 +4,9 @@ The declared interpretation is compared with candidates, which differ from it by
 The misfit of an interpretation is a sum of unexplained shares, each from 0 to 1. They do not depend
 on lengths, so that slip, which shortens the motion, does not count against the true interpretation:
 
-    pose, and commanded twist   body increments along each axis that those predicted from the wheels
-                                do not explain
-    wheels                      turns that no motion of a rigid body makes (beyond three wheels)
-    commanded wheel speeds      turns that the commanded turns do not explain
+    pose, and commanded twist   body increments along each axis that the wheels do not explain
+    wheels                      rotations impossible for a rigid body (with more than three wheels)
+    commanded wheel speeds      rotations that the commanded rotations do not explain
     gyro                        heading increments that those of the gyro do not explain
 """
 
@@ -40,11 +39,11 @@ class Interpretation:
 
     Attributes:
         order: column of each wheel, counted from 0; empty for the declared order.
-        sign: sign of each wheel, relative to the declared sign; empty if all are as declared.
+        sign: sign of each wheel, relative to the declared sign; empty if all signs are as declared.
         azimuth: correction to the declared directions of all wheels [deg].
         convention: convention of the poses.
-        command_order: the same as `order`, for the commanded wheel speeds.
-        command_sign: the same as `sign`, for the commanded wheel speeds.
+        command_order: like `order`, for the commanded wheel speeds.
+        command_sign: like `sign`, for the commanded wheel speeds.
         twist_sign: signs of the commanded x, y and yaw rate, relative to the declared signs.
         gyro_sign: sign of the gyro, relative to the declared sign.
     """
@@ -142,7 +141,7 @@ def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evide
 
 
 def _correlation_with_gyro(gyro: np.ndarray, body: np.ndarray, found: Products) -> float:
-    """Return the correlation of the turns by gyro and by heading, 0 if one of them never turns."""
+    """Return the correlation of rotation by gyro and by heading, 0 if one of them is constant."""
     turned = np.stack([gyro[found.known, 0], body[found.known, 2]])
     (gyro_square, both), (_, pose_square) = (turned * found.weight) @ turned.T
     size = np.sqrt(gyro_square * pose_square)
@@ -216,7 +215,7 @@ def _unexplained(
         sums: products of turns and body increments.
         predict: matrix from turns to body increments.
         axes: matrix from the axes of the measured body increments to the true ones.
-        free: whether the wheels determine all three components of the twist.
+        free: True if the wheels determine all three components of the twist.
     """
     predicted, both = sums.predicted(predict), sums.matched(predict, axes)
     measured = np.diag(axes @ sums.body @ axes.T)
@@ -225,7 +224,9 @@ def _unexplained(
         return 1.0
     moves = predicted > LEAST_MOTION * total
     explained = np.where(moves, both.clip(0) ** 2 / np.where(moves, predicted, 1.0), 0.0)
-    if not free and moves[:2].any():  # all wheels roll in one direction: a factor for both axes
+    if (
+        not free and moves[:2].any()
+    ):  # All wheels roll in one direction, so one factor applies to both axes.
         explained[:2] = 0.5 * max(both[:2].sum(), 0.0) ** 2 / predicted[:2].sum()
     along = 1.0 - explained[:2].sum() / max(measured[:2].sum(), 1e-300)
     about = 1.0 - explained[2] / max(measured[2], 1e-300)
@@ -236,7 +237,7 @@ def _unexplained(
 def _beyond_rigid(
     sums: Products, rolling: Float[np.ndarray, "wheel 3"], wheels: Float[np.ndarray, "wheel wheel"]
 ) -> float:
-    """Return the share of the wheels' turns that no motion of a rigid body without slip makes."""
+    """Return the share of the wheels' rotation that is impossible for a rigid body without slip."""
     basis, values, _ = np.linalg.svd(rolling, full_matrices=False)
     basis = basis[:, values > 1e-6 * values[0]]
     turns = wheels @ sums.turns @ wheels.T

@@ -1,4 +1,4 @@
-"""Channels of all runs on one clock, and their increments over common time steps.
+"""Channels of all runs on one time axis, and their increments over common time steps.
 
 The module also defines the conventions that logged poses may follow, with the body increments under
 each, and the sums of products of increments by which interpretations are compared.
@@ -24,8 +24,8 @@ from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_increments, integral, interpolate
 
 STEP_S = 0.4
-"""Duration of a step [s]: so long that jitter and rounding matter little, and short compared with
-the time in which a robot turns round."""
+"""Duration of a step [s]: long enough that jitter and rounding matter little, and short compared
+with the time of a turn."""
 INTEGRATED = ("wheel_speed", "wheel_speed_command", "twist_command", "gyro")
 """Channels of rates, which are compared by their integrals."""
 MOST_STEPS = 20_000
@@ -35,7 +35,7 @@ made longer."""
 
 @dataclass(frozen=True, eq=False)
 class JoinedChannel:
-    """One channel of all runs, end to end on the clock of `JoinedRuns`.
+    """One channel of all runs, on the time axis of `JoinedRuns`.
 
     Attributes:
         time: times of the rows, increasing [s].
@@ -52,7 +52,7 @@ class JoinedChannel:
 
 @dataclass(frozen=True, eq=False)
 class JoinedRuns:
-    """Channels of all runs, one run after another on a common clock, with pauses in between.
+    """Channels of all runs, one run after another on a common time axis, with pauses in between.
 
     Attributes:
         names: names of the runs.
@@ -106,7 +106,7 @@ class StepEdges:
 
 @dataclass(frozen=True, eq=False)
 class ChannelIncrements:
-    """Increments of the robot's own channels over the steps, shifted by the lag of the poses.
+    """Increments of all channels but the poses over the steps, shifted by the lag of the poses.
 
     Attributes:
         wheels: rotation of each wheel [rad]; nan if it was not logged for the whole step.
@@ -161,7 +161,7 @@ def _rows(log: Log, name: str, columns: int) -> Float[np.ndarray, "row column"]:
 
 
 def edges(data: JoinedRuns) -> StepEdges:
-    """Return every run cut into steps of equal duration, of about `STEP_S`.
+    """Return the edges of steps of about `STEP_S`, of equal duration within each run.
 
     Steps are shorter in short runs, so that a median run has eight, but never shorter than a row.
     """
@@ -208,7 +208,7 @@ class PoseConvention:
 
     Attributes:
         heading: meaning of the logged heading.
-        y_down: whether y has the opposite sign.
+        y_down: True if the logged y axis points to the right of x, not to the left.
         offset: whole degrees to add to the heading [deg].
     """
 
@@ -218,7 +218,7 @@ class PoseConvention:
 
     @property
     def bare(self) -> "PoseConvention":
-        """Return the same convention with an offset of 0."""
+        """The same convention with an offset of 0."""
         return replace(self, offset=0)
 
 
@@ -277,7 +277,7 @@ class Products:
         turns: products of turns with turns (wheel, wheel) [rad^2].
         across: products of turns with body increments (wheel, 3) [rad m].
         body: products of body increments with each other (3, 3) [m^2].
-        known: whether both turns and body increment are known, for every step (every,).
+        known: True if both turns and body increment are known, for every step (every,).
         weight: weight of each known step (step,).
     """
 

@@ -18,12 +18,12 @@ LEAST_REDUCTION = 0.05
 """Constant part of the least reduction of the misfit for which a mistake is accepted,
 `LEAST_REDUCTION` plus `REDUCTION_SHARE` times the remaining misfit [1]."""
 REDUCTION_SHARE = 0.3
-"""Relative part of that least reduction [1]; no real log without a mistake comes near it."""
+"""See `LEAST_GAIN` [1]; real logs without a mistake stay far below this reduction."""
 MOST_UNEXPLAINED = 0.4
 """Largest share of the poses' motion that an accepted pose convention leaves unexplained [1]."""
 ALTERNATIVE_MARGIN = 0.02
 """Difference of misfits below which another kind of mistake is named as an alternative [1]."""
-TURN_DEG = 15
+GRID_DEG = 15
 """Grid spacing of the searched heading offsets and azimuths [deg]."""
 MOST_PERMUTED = 6
 """Number of wheels above which only exchanges of two columns are tried, not all orders."""
@@ -36,8 +36,8 @@ class Candidate:
     Attributes:
         kind: name of the kind of mistake.
         meant: the interpretation.
-        cost: small number added to the misfit when candidates are ranked, so that of those with
-            about the same misfit the simplest mistake is accepted [1].
+        cost: small number added to the misfit when candidates are ranked, so that of several
+            candidates with about the same misfit the simplest is accepted [1].
     """
 
     kind: str
@@ -47,13 +47,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake in the declaration, whose correction explains the logs decisively better.
+    """A mistake in the config, whose correction explains the logs decisively better.
 
     Attributes:
         found: the candidate interpretation that corrects the mistake.
         before: misfit without the correction.
         after: misfit with the correction.
-        others: corrections of other kinds of mistake that explain the logs about as well.
+        others: corrections of other kinds that explain the logs about equally well.
     """
 
     found: Candidate
@@ -77,7 +77,7 @@ def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
 def _next_mistake(evidence: Evidence, current: Interpretation) -> Mistake | None:
     """Return the simplest mistake that explains the logs decisively better, or None."""
     before = sum(misfits(evidence, current).values())
-    # Another convention of the poses counts only if the poses then follow the wheels.
+    # Another convention of the poses is accepted only if the poses then follow the wheels.
     tried = [
         (sum(left.values()), c)
         for c in candidates(evidence, current)
@@ -101,7 +101,7 @@ def candidates(evidence: Evidence, current: Interpretation) -> Iterator[Candidat
         yield Candidate("wheel_sign", replace(current, sign=sign), cost)
     for order, cost in _orders(wheels):
         yield Candidate("wheel_order", replace(current, order=order), cost)
-    for azimuth in range(-180 + TURN_DEG, 180, TURN_DEG):
+    for azimuth in range(-180 + GRID_DEG, 180, GRID_DEG):
         if azimuth:
             yield Candidate("wheel_azimuths", replace(current, azimuth=azimuth), 0.025)
     if current.convention == PoseConvention():
@@ -137,16 +137,17 @@ def _conventions(current: Interpretation) -> Iterator[Candidate]:
     yield other("heading_unit", 0.0, PoseConvention("degrees"))
     yield other("heading_unit", 0.0, PoseConvention("radians"))
     yield other("heading_quaternion", 0.005, PoseConvention("half_sine"))
-    for offset in range(-180 + TURN_DEG, 181, TURN_DEG):
+    for offset in range(-180 + GRID_DEG, 181, GRID_DEG):
         if offset:
             cost = 0.01 if offset % 90 == 0 else 0.02
             yield other("heading_offset", cost, PoseConvention(offset=offset))
 
 
 def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Yield every choice of reversed wheels, as signs, with its cost.
+    """Yield the signs of the wheels for every choice of reversed wheels, each with its cost.
 
-    A single wheel, all wheels, or the wheels of one side cost nothing; any other choice costs 0.02.
+    Reversing a single wheel, all wheels, or the wheels of one side costs nothing; any other choice
+    costs 0.02.
     """
     sides = {tuple(np.flatnonzero(side)) for side in (rolling[:, 2] > 0, rolling[:, 2] < 0)}
     for count in range(1, wheels + 1):

@@ -48,11 +48,11 @@ was computed from the speed [1]."""
 _Range = tuple[float, float, float]
 """Least, usual and largest natural value of a ratio [1]."""
 _WIDE: Mapping[str, _Range] = {
-    # A carpet may hold a robot in place, hence the small lower end (used if commands confirm the
+    # A robot may slip in place on carpet, hence the small lower end (used if commands confirm the
     # motion of the wheels). The scale of a camera may be wrong by an eighth.
     "travel": (0.012, 0.8, 1.35),
     "turning": (0.35, 0.8, 1.35),
-    # Commands precede the motion, and are larger than it where brakes or limits act.
+    # Commands precede the motion, and exceed it if brakes or limits act.
     "drive": (0.65, 1.1, 1.75),
     "steer": (0.65, 1.1, 1.75),
     "command": (0.7, 1.1, 1.75),
@@ -60,7 +60,7 @@ _WIDE: Mapping[str, _Range] = {
     "gyro": (0.75, 1.0, 1.33),
 }
 _UNVOUCHED: _Range = (0.3, 0.8, 1.35)
-"""Natural range of `travel` if no command was logged that could confirm the wheels' motion."""
+"""Natural range of `travel` if no command was logged to confirm the motion of the wheels."""
 _SCRUBBING: Mapping[str, _Range] = {"turning": (0.25, 0.55, 1.15), "steer": (0.4, 1.3, 3.2)}
 """Natural ranges for robots whose wheels cannot roll sideways: they turn less than their wheel
 speeds and track predict, and their drivers command more rotation to make up for it."""
@@ -130,7 +130,7 @@ def _along(
         return None, None
     ahead, about = predicted[:2].sum(), predicted[2]
     along = float(both[:2].sum() / ahead) if ahead > LEAST_TRANSLATION * total else None
-    # Rotations that are predicted to be small are hidden by the rotations that slip causes.
+    # Small predicted rotations are hidden by rotations due to slip.
     turns = about > LEAST_TURNING * total and both[2] ** 2 > 0.25 * about * sums.body[2, 2]
     return along, float(both[2] / about) if turns else None
 
@@ -180,7 +180,7 @@ def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
 MARGIN = 0.02
 """Margin by which a common factor may lie outside the range of a fitting cause, in its logarithm
 [1]."""
-ROWS_S = (0.001, 1.5)
+USUAL_ROW_S = (0.001, 1.5)
 """Range of the time between rows in which the unit of time is not suspected [s]."""
 
 
@@ -258,7 +258,7 @@ class ScaleCause(NamedTuple):
     Attributes:
         name: name of the quantity in `QUANTITIES`.
         factor: factor by which the quantity, or the values of its channels, are too large [1].
-        common: whether the factor is a common error, such as 1000.
+        common: True if the factor is a common error, such as 1000.
     """
 
     name: str
@@ -276,14 +276,14 @@ def single_causes(
 
     Args:
         known: ratios by name.
-        speed_is_angle: whether the wheels' angle was integrated from their speeds.
+        speed_is_angle: True if the wheels' angle was integrated from their speeds.
         row_s: median time between rows [s].
         gear_ratio: declared gear ratio.
     """
     if all(r.natural for r in known.values()):
         return (), True
     possible = _possible(speed_is_angle, gear_ratio)
-    if ROWS_S[0] <= row_s <= ROWS_S[1]:
+    if USUAL_ROW_S[0] <= row_s <= USUAL_ROW_S[1]:
         del possible["time"]
     if single := _singles(known, possible):
         return tuple(sorted(single, key=lambda e: not e.common)), True

@@ -1,7 +1,7 @@
 """The sanity check of runs before a fit.
 
-It checks whether encoders, commands, gyro, currents and poses agree with each other and with the
-declared robot.
+Encoders, commands, gyro, currents and poses must agree with each other and with the geometry in the
+config.
 
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_speed_unit`,
 `heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
@@ -56,19 +56,18 @@ from slipid.model.geometry import Geometry
 FEWEST_STEPS = 20
 """Least number of steps in which poses and wheels can be compared."""
 UNEXPLAINED_IF_FOREIGN = 0.4
-"""Share of the poses' motion left unexplained, in the best interpretation, above which poses and
-wheels do not belong together [1]."""
+"""If the best interpretation leaves more than this share of the poses' motion unexplained, poses
+and wheels do not belong together [1]."""
 LATE_S = 1.0
-"""Magnitude of the lag of the poses from which there is a finding [s]."""
+"""Smallest magnitude of the lag of the poses that is a finding [s]."""
 TOO_LATE_S = 1.9
-"""Magnitude of the lag above which the finding is `wrong`, since a fit would start too far off
-[s]."""
+"""A finding about a larger lag is `wrong`, since a fit would start too far from it [s]."""
 SLOW_M_S, SLOW_ROW_S = 0.01, 2.0
-"""Rim speed [m/s] and time between rows [s]: if the speed is below and the time above these, the
-unit of time is smaller than declared."""
+"""If the rim speed [m/s] is below and the time between rows [s] above these values, the unit of
+time is smaller than declared."""
 FAST_M_S, FAST_ROW_S = 50.0, 1e-3
-"""Rim speed [m/s] and time between rows [s]: if the speed is above and the time below these, the
-unit of time is larger than declared."""
+"""If the rim speed [m/s] is above and the time between rows [s] below these values, the unit of
+time is larger than declared."""
 SHORT_TRAVEL = 0.62
 """Ratio of the body's path length to that of the wheels below which there is a finding if no
 command confirms the wheels [1]."""
@@ -83,7 +82,7 @@ class _Compared:
         moved: increments of the robot's channels, shifted by the lag of the poses.
         evidence: sums of products of these increments and those of the body.
         meant: the right interpretation.
-        poses: whether the poses are usable for further comparisons.
+        poses: True if the poses are usable for further comparisons.
     """
 
     findings: tuple[Finding, ...]
@@ -94,7 +93,7 @@ class _Compared:
 
 
 def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tuple[Finding, ...]:
-    """Return what is wrong with runs or with their declaration, the worst first, then notes.
+    """Return the findings about runs and their config, the worst first, notes last.
 
     Args:
         data: runs.
@@ -159,14 +158,15 @@ def _compared(
 
 
 def _of_lag(lag: PoseLag) -> Iterator[Finding]:
-    """Yield the finding about poses that come much later or earlier than the encoders."""
+    """Yield the finding that the poses are much later or earlier than the encoders, if they are."""
     if abs(lag.seconds) < LATE_S:
         return
     late = "after" if lag.seconds > 0 else "before"
     yield Finding(
         "lag",
-        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.unexplained:.2f} of "
-        f"the motion is left unexplained, without {lag.unexplained_at_zero:.2f}",
+        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: with this lag "
+        f"{lag.unexplained:.2f} of the motion is unexplained, without it "
+        f"{lag.unexplained_at_zero:.2f}",
         f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] "
         f"at {lag.seconds:.1f}",
         "wrong" if abs(lag.seconds) > TOO_LATE_S else "suspicious",
@@ -180,10 +180,10 @@ def _foreign(left: float) -> Finding:
     """
     return Finding(
         "pose_unexplained",
-        f"the poses do not follow the wheels: {left:.2f} of their motion is left unexplained, in "
-        "any order, with any signs and axes",
-        "check whether poses and encoders are of the same runs and of the same time, and whether "
-        "the wheels were on the ground",
+        "the poses do not follow the wheels: for every order, sign and axis tried, at least "
+        f"{left:.2f} of their motion is unexplained",
+        "check that poses and encoders come from the same runs and times, and that the wheels "
+        "were on the ground",
     )
 
 
@@ -192,7 +192,8 @@ def _of_time(
 ) -> Iterator[Finding]:
     """Yield the finding that time is in another unit than declared.
 
-    It uses implausible rim speeds and times between rows, for logs whose ratios do not show it.
+    The evidence is an implausible rim speed and time between rows; ratios of channels may not show
+    it.
     """
     row = float(np.median(data.row))
     speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * radius
@@ -207,17 +208,17 @@ def _of_time(
 
 
 def _suspicious(scales: Mapping[str, ScaleRatio]) -> Iterator[Finding]:
-    """Yield the finding that the wheels travel much further than the body, without any command."""
+    """Yield the finding that the wheels travel much further than the body, without a command."""
     travel = scales.get("travel")
     if travel is None or "drive" in scales or "command" in scales:
         return
     if travel.natural and travel.value < SHORT_TRAVEL:
         yield Finding(
             "travel",
-            f"the body's path length is {travel.value:.2f} times the wheels', and no command "
-            "is logged that could confirm the wheels",
+            f"the path of the body is {travel.value:.2f} times as long as that of the wheels, and "
+            "no command is logged that could confirm the wheels",
             "check wheel_radius_m, gear_ratio, ticks_per_revolution and the unit of the poses, "
-            "unless the wheels slip so much",
+            "unless the wheels really slip that much",
             "suspicious",
         )
 
@@ -233,18 +234,19 @@ def _notes(data: JoinedRuns, evidence: Evidence, meant: Interpretation) -> Itera
                 "no run turns: base radius, unit of the heading and gyro are unchecked"
             )
         if share[0] < LEAST_TRANSLATION:
-            yield _not_checked("no run drives ahead: order and signs are checked in part only")
+            yield _not_checked("no run drives ahead: order and signs are only partly checked")
         if evidence.free and share[1] < LEAST_TRANSLATION:
-            yield _not_checked("no run drives sideways: order and signs are checked in part only")
+            yield _not_checked("no run drives sideways: order and signs are only partly checked")
     if evidence.twist is None and evidence.command is None:
         yield _not_checked(
-            "no command is logged: wheel turns that are logged too large look like wheels that slip"
+            "no command is logged, so logged wheel rotations that are too large cannot be told "
+            "from slip"
         )
     if "current" in data.channels and not data.current_is_signed:
         yield _not_checked("currents are magnitudes: their signs cannot be checked")
     gyro = data.channels.get("gyro")
     if gyro is not None and not np.nanmax(np.abs(np.diff(gyro.value, axis=0))) > 0:
-        yield _not_checked("the gyro never changes: it cannot be checked")
+        yield _not_checked("the gyro channel is constant and cannot be checked")
 
 
 def _not_checked(what: str) -> Finding:

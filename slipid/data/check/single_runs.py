@@ -1,4 +1,4 @@
-"""Search for single runs with wrong poses: poses of another run, or poses that never change."""
+"""Search for single runs with wrong poses: poses of another run, or constant poses."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,11 +18,12 @@ from slipid.data.check.joined import (
 )
 
 LEAST_PATH_M = 0.2
-"""Path length by the wheels above which a run is judged, since its poses must move as well [m]."""
+"""A run is judged if the path length by the wheels exceeds this, since its poses must then move
+[m]."""
 ROUNDING_M = 1e-6
-"""Path length below which poses do not change, except for rounding [m]."""
+"""Poses with a path shorter than this are constant, except for rounding [m]."""
 LEAST_ROWS = 20
-"""Least number of rows of a run that is judged."""
+"""Runs with fewer rows are not judged."""
 ODD_DISAGREEMENT, ODD_RATIO, USUAL_COSINE = 0.3, 10.0, 0.9
 """A run has poses of another run if its disagreement, 1 - cosine, exceeds both `ODD_DISAGREEMENT`
 and `ODD_RATIO` times that of the median run. No run is judged if the median run's cosine is below
@@ -31,7 +32,7 @@ LONGEST_RATIO = 4.0
 """Multiple of the median length of the body increments to which longer increments are
 shortened [1]."""
 SHARE_IF_ALL = 0.5
-"""Share of runs with constant poses from which the finding is about all runs [1]."""
+"""If at least this share of the runs has constant poses, the finding is about all runs [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class RunAgreement:
         poses_m: path length of the poses (run,) [m].
         cosine: normalised scalar product of the body increments from the poses and from the wheels
             (run,) [1].
-        judged: whether the run has enough rows, and its wheels travel far enough, to be judged
+        judged: True if the run has enough rows, and its wheels travel far enough, to be judged
             (run,).
     """
 
@@ -56,7 +57,7 @@ class RunAgreement:
 
     @property
     def still(self) -> Bool[np.ndarray, " run"]:
-        """Return, for each run, whether its poses do not change although its wheels turn."""
+        """Return, for each run, whether its poses are constant although its wheels turn."""
         return self.judged & (self.poses_m < ROUNDING_M)
 
 
@@ -108,10 +109,10 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             f"travel {np.median(compared.wheels_m[still]):.2g} m",
             "check the columns of pose_x, pose_y and pose_heading, and the marker's visibility"
             if every
-            else "leave these runs out of the globs of [[logs]]",
+            else "exclude these runs from the globs of [[logs]]",
             runs=() if every else _names(data, still),
         )
-    # Runs in which the floor holds the robot in place disagree for a reason, and are not judged.
+    # Runs in which the robot slips in place disagree for a good reason, and are not judged.
     moves = compared.judged & ~still
     if moves.any():
         share = compared.poses_m / np.maximum(compared.wheels_m, 1e-300)
@@ -125,8 +126,8 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             f"the poses of {odd.sum()} of {len(odd)} runs do not follow their wheels "
             f"(agreement {np.median(compared.cosine[odd]):.2f}, in the others "
             f"{np.median(compared.cosine[moves & ~odd]):.2f})",
-            "check whether these files hold poses of another run, or of another time, and leave "
-            "them out of the globs of [[logs]]",
+            "check whether these files contain poses of another run or of another time; if so, "
+            "exclude them from the globs of [[logs]]",
             runs=_names(data, odd),
         )
 

@@ -2,7 +2,7 @@
 
 The log has a row for every time at which something was measured. Wheel angles are interpolated
 linearly between their readings; every other channel keeps its latest reading, and repeated readings
-are marked as not fresh, so that none counts twice.
+are marked as not fresh, so that none is used twice.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,7 +21,7 @@ from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
 
 EPOCH = 1e6
-"""Time above which a clock must count from 1970, not from the start of the robot [s]."""
+"""Times above this are counted from 1970, not from the start of the robot [s]."""
 
 
 def assembled(run: RawRun, layout: SensorLayout) -> Log:
@@ -33,7 +33,7 @@ def assembled(run: RawRun, layout: SensorLayout) -> Log:
     """
     signals = run.signals
     if not signals:
-        found = "no column of anything but the time is known"
+        found = "no column except that of the time is known"
         raise bad_data(run.identity.path, found, "columns of the wheels and of the pose")
     turns = next((name for name in TURNS if name in signals), None)
     clock = clock_of(list(signals.values()))
@@ -83,7 +83,10 @@ def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
         at = first_true((steps > 20 * usual) & (steps > layout.max_gap))
         if at is not None:
             found = f"no value for {steps[at]:.3g} s"
-            expected = f"one about every {usual:.3g} s, and none missing for {layout.max_gap:g} s"
+            expected = (
+                f"values about every {usual:.3g} s, without gaps of more than max_gap = "
+                f"{layout.max_gap:g} s"
+            )
             raise signal.source.error(found, expected, sample=int(there[at]) + 1, column=column)
 
 
@@ -143,7 +146,9 @@ def _angle(
     if name.endswith("speed"):
         notes.append("wheel angle integrated from the reported speed")
     if slow:
-        notes.append("wheel speeds refresh slower than rows: each reading counts once")
+        notes.append(
+            "wheel speeds are refreshed less often than rows are logged: each reading is used once"
+        )
     angle = np.stack(columns, axis=1) * per_wheel(name, layout)
     return angle - angle[0]
 
@@ -168,17 +173,17 @@ def _ticks(
     steps = np.diff(ticks)
     if np.abs(steps).max(initial=0.0) <= 0.5 * period:
         return ticks
-    note = f"tick counter wrapped around at {layout.tick_bits} bits and was continued"
+    note = f"the wrap-around of the tick counter at {layout.tick_bits} bits was removed"
     if note not in notes:
         notes.append(note)
     return ticks - period * np.concatenate([[0.0], np.cumsum(np.round(steps / period))])
 
 
 def _of_wheels(signals: Mapping[str, Signal], layout: SensorLayout) -> dict[str, Signal]:
-    """Return the signals, with speeds at the wheels and currents also if others were logged.
+    """Return the signals, with wheel speeds and currents computed if they were not logged.
 
-    Such speeds are those of the motors over the gear ratio; such currents are the reported torques
-    over the torque constant.
+    These speeds are the motor speeds divided by the gear ratio; these currents are the logged
+    torques divided by the torque constant.
     """
     gear, constant = layout.gear_ratio, float(layout.torque_constant or 1.0)
     out = dict(signals)
@@ -216,7 +221,7 @@ def _pose(
     times, samples = times[whole], samples[whole]
     if not len(times):
         raise signals["pose_x"].source.error(
-            "no pose while the wheels were measured", "clocks that agree: both from the same start"
+            "no pose while the wheels were measured", "times of both counted from the same start"
         )
     samples[:, 2] = np.unwrap(samples[:, 2])
     new = np.ones(len(times), dtype=bool)
@@ -234,7 +239,7 @@ def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]
     Args:
         run: run with the signals of the robot's own file.
         layout: layout of that file.
-        poses: signals of the pose's channels, on their own clock.
+        poses: signals of the channels of the pose, with times on the clock of the poses.
 
     Raises:
         UnusablePose: the motion does not determine the offset between the clocks.
@@ -248,11 +253,11 @@ def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]
     clock = best_clock(_motion_pairs(log, time, np.column_stack(columns)))
     if clock is None:
         raise UnusablePose(
-            f"{parts[0].source.path}: the motion does not determine its clock against that of "
-            f"{log.name}; expected poses of the same run, with starts, stops and turns in both, "
-            "and the video's frame rate"
+            f"{parts[0].source.path}: the motion does not determine the offset of its clock from "
+            f"that of {log.name}; expected poses of the same run, with starts, stops and turns in "
+            "both, and the correct frame rate of the video"
         )
-    # If the robot's clock counts from 1970, the times of the log start at zero instead.
+    # The times of the log start at zero if the robot's clock counts from 1970.
     turns = next(name for name in TURNS if name in run.signals)
     start = float(run.signals[turns].time[0] - log.time[0])
     return replace(clock, offset=clock.offset + start)

@@ -22,7 +22,10 @@ _LIMITS = {
     "current": (1000.0, "A"),
     "bus_voltage": (1000.0, "V"),
     "duty": (1.5, "(a share of 1)"),
-    "voltage": (1000.0, "V"),  # may be the product of the two channels above, hence checked later
+    "voltage": (
+        1000.0,
+        "V",
+    ),  # Checked last, since it may be the product of the two channels above.
     "gyro": (100.0, "rad/s"),
 }
 
@@ -54,7 +57,7 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
 
 
 class UnusablePose(DataError):
-    """Error about a single run whose poses jump, or whose clock the motion does not determine.
+    """Error about a run whose poses jump, or whose clock offset the motion does not determine.
 
     Such a run is left out, and the other runs are read.
     """
@@ -82,7 +85,7 @@ def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> 
     if log.current is not None and not log.current_is_signed and log.current.min() < 0:
         i, j = _first(log.current < 0)
         found = f"a negative current ({log.current[i, j]:.4g} A)"
-        expected = "magnitudes only, as the layout says (current_is_signed = false)"
+        expected = "magnitudes only, as declared in the layout (current_is_signed = false)"
         raise _at(log, signals, "current", i, j, found, expected)
     _check_wheels(log, signals, layout)
     if log.pose is not None:
@@ -90,12 +93,12 @@ def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> 
 
 
 def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
-    """Raise `DataError` if a wheel turns impossibly fast, or does not turn although commanded."""
+    """Raise `DataError` if a wheel turns impossibly fast, or stands still against its command."""
     if not log.wheels:
         return
     rates = np.abs(np.diff(log.wheel_angle, axis=0)) / np.diff(log.time)[:, None]
-    # In correct logs, the jump after a telemetry stall looks like ten times the usual wheel speed;
-    # a counter that restarts looks like a hundred times.
+    # In correct logs, the jump after a telemetry stall is about ten times the usual wheel speed;
+    # the jump of a restarted counter is about a hundred times it.
     limit = max(30.0, 20.0 * float(np.quantile(rates, 0.99)))
     if rates.max() > limit:
         i, j = _first(rates > limit)
@@ -152,7 +155,7 @@ _NAMES = {
     "current": ("current", "motor_torque", "wheel_torque"),
     "voltage": ("voltage", "duty"),
 }
-"""Channels of a file, by the name of the log's channel that may be computed from them."""
+"""Channels of a file from which a channel of the log may be computed, by the name of the latter."""
 
 
 def _at(
@@ -164,7 +167,7 @@ def _at(
     found: str,
     expected: str,
 ) -> DataError:
-    """Return the error about a value of the log, with its place in the file that it comes from.
+    """Return the error about a value of the log, with the place in the file from which it was read.
 
     Args:
         log: the log.
@@ -172,7 +175,7 @@ def _at(
         name: channel of the log.
         i: row of the log, or None for an error about all rows.
         j: column of the channel.
-        found: what is wrong.
+        found: description of what is wrong.
         expected: what was expected instead.
     """
     signal = next((signals[n] for n in _NAMES.get(name, (name,)) if n in signals), None)

@@ -1,4 +1,4 @@
-"""Dictionary of words in column and topic names, by which a name is assigned a channel and unit."""
+"""Dictionary of words in column and topic names, from which the channel and unit are guessed."""
 
 import re
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ _LONG = [word for word in _ROLES if len(word) >= 4]
 _NEAR = 0.82
 """Least similarity (`difflib`) for which a word counts as a misspelling of a known one [1]."""
 _LETTERS = 3
-"""Largest length of a word that may be read as a sequence of one-letter words, such as wl."""
+"""Words up to this length, such as wl, may be read as a sequence of one-letter words."""
 _SUFFIXES = {
     **{"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us"},
     **{"usec": "us", "ns": "ns", "nsec": "ns", "m": "m", "mm": "mm", "cm": "cm"},
@@ -80,15 +80,15 @@ _SUFFIXES = {
     **{"a": "A", "amps": "A", "ma": "mA", "v": "V", "mv": "mV", "nm": "N*m"},
     **{"%": "%", "percent": "percent", "pct": "percent"},
 }
-"""Units by the ending of a column name that stands for them."""
+"""Units by the endings of column names that denote them."""
 _BY_UNIT = {"tick": "ticks", "A": "current", "V": "voltage", "N*m": "torque", "rad/s": "speed"}
 _SHORT = ("v", "a", "s", "m")
-"""Endings that count as units only if the name is not understood with them as words."""
+"""Endings that are taken as units only if the name is not understood with them as words."""
 
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Meaning of a column's name.
+    """Meaning of the name of a column.
 
     Attributes:
         channel: one of `CHANNELS`; or `wheel_position`, `wheel_v`, `motor_position` or `motor_v` if
@@ -111,13 +111,15 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
     Args:
         name: name of the column.
         unit: cell of the column in a row of units; empty without such a row.
-        of_motor: whether the log is of motors without a robot, so that columns need not name a
-            wheel or motor.
+        of_motor: True if the log is that of motors on a bench, whose columns need not name a wheel
+            or motor.
     """
     bare, suffix = without_unit(name)
     unit = unit_in(unit) or unit or suffix
     texts = [bare] if "[" in name or "(" in name or "," in name else [bare, name]
-    if name[len(bare) :].lower()[1:] in _SHORT:  # v may be a speed, a and s other things
+    if (
+        name[len(bare) :].lower()[1:] in _SHORT
+    ):  # v may mean a speed; a and s have other meanings, too
         texts.reverse()
     tried = [(name_parts(text), strict) for strict in (True, False) for text in texts]
     for parts, strict in tried:
@@ -236,7 +238,7 @@ def _split(name: str) -> list[str]:
 
 
 def _apart(word: str) -> list[str]:
-    """Return the fewest known words that a compound such as `setvel` or `wl` consists of.
+    """Return the shortest list of known words that form a compound such as `setvel` or `wl`.
 
     If there are none, the result is the word itself.
     """
@@ -258,12 +260,16 @@ def _apart(word: str) -> list[str]:
 
 
 def _doubt(parts: NameParts, channel: str) -> str:
-    """Return a text about an assumption made about a name, empty if none was made."""
+    """Return a text about an assumption that was made about a name, empty if none was made."""
     if channel.startswith("twist") and not parts.has("what", "command"):
-        return "is it a command? Measured speeds do not belong here"
+        return "is it a command? Measured speeds must not be used here"
     if parts.mended:
         return "misspelled? " + ", ".join(parts.mended)
-    return f"{', '.join(parts.unknown)} in its name is not known" if parts.unknown else ""
+    return (
+        f"its name contains {', '.join(parts.unknown)}, which is not understood"
+        if parts.unknown
+        else ""
+    )
 
 
 def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
@@ -285,7 +291,7 @@ def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
 
 
 def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
-    """Return the channel and the label of a name in a log of motors without a robot, or None."""
+    """Return the channel and the label of a name in a log of motors on a bench, or None."""
     if parts.has("not"):
         return None
     single = _single(parts)
@@ -319,7 +325,9 @@ def _measured(parts: NameParts, unit: str) -> str | None:
     for what in ("ticks", "current", "torque", "voltage", "duty", "speed"):
         if parts.has("what", what):
             return what
-    if parts.has("what", "position", "angle", "yaw"):  # w comes later, since it may be a wheel
+    if parts.has(
+        "what", "position", "angle", "yaw"
+    ):  # w is checked later, since it may mean a wheel
         return "position"
     if parts.has("what", "angular", "w"):
         return "speed"

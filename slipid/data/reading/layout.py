@@ -54,7 +54,7 @@ GROUPS = {
 }
 """Groups of channels that one message contains, by the name of the group in the layout of a bag."""
 TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels from which the wheels' turns are known; the first available one counts."""
+"""Channels from which the turns of the wheels can be computed; the first available one is used."""
 
 Count = Annotated[int, Field(ge=0, strict=True)]
 
@@ -69,11 +69,13 @@ class Channel:
     """Columns of one channel: value = (scale x cell + offset), in `unit`.
 
     Attributes:
-        columns: their names, one per wheel where the channel has one; positions counted from 0 in
-            a file without names.
-        unit: the unit in the file; `pixel` is converted to metres by the layout.
-        scale: a sign or a correction, one number for all columns or one for each.
-        offset: added after the scale, in `unit`.
+        columns: names of the columns (one per wheel for channels of wheels), or, in a file without
+            column names, their positions counted from 0.
+        unit: unit of the numbers in the file; `pixel` is converted to metres by `metres_per_pixel`
+            of the layout.
+        scale: factor on the numbers, such as -1 for a reversed sign: one number for all columns, or
+            one per column.
+        offset: number that is added after scaling, in `unit`.
     """
 
     columns: Annotated[
@@ -88,7 +90,8 @@ class Channel:
     def __post_init__(self) -> None:
         if len(self.scale) not in (1, len(self.columns)):
             raise ValueError(
-                f"{len(self.scale)} scales for {len(self.columns)} columns; expected as many"
+                f"{len(self.scale)} scales for {len(self.columns)} columns; expected one scale, "
+                "or one per column"
             )
 
 
@@ -97,15 +100,20 @@ class SensorLayout:
     """Properties of the robot's sensors that do not depend on the type of its files.
 
     Attributes:
-        ticks_per_revolution: ticks of the encoder in one turn of the *motor* shaft.
+        ticks_per_revolution: encoder ticks in one turn of the *motor* shaft.
         gear_ratio: turns of the motor per turn of the wheel.
-        ticks_are_increments: whether ticks count since the last sample.
-        tick_bits: width of the tick counter, at which it wraps around.
-        current_is_signed: False where currents are magnitudes.
-        torque_constant: torque per current of the *motor* [N m/A], where a driver reports torques.
-        max_gap: longest time between samples of a wheel [s]; a longer one is refused.
-        max_pose_jump: longest path between two poses [m]; a run with a longer one is left out.
-        max_heading_jump: largest turn between two poses [rad]; a run with a larger one is left out.
+        ticks_are_increments: true if each row has the ticks since the previous row, not the total
+            count.
+        tick_bits: number of bits of the tick counter, after which it wraps around.
+        current_is_signed: false if the logged currents are magnitudes.
+        torque_constant: torque of the *motor* per current [N m/A], needed if the logs have torques
+            instead of currents.
+        max_gap: longest allowed time between two samples of a wheel [s]; a log with a longer gap is
+            an error.
+        max_pose_jump: longest allowed distance between two successive poses [m]; a run with a
+            longer one is left out.
+        max_heading_jump: largest allowed turn between two successive poses [rad]; a run with a
+            larger one is left out.
     """
 
     ticks_per_revolution: Positive | None = None
@@ -128,17 +136,18 @@ class SensorLayout:
             return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
         if {"motor_torque", "wheel_torque"} & have and self.torque_constant is None:
             wanted = "expected the motor's torque per current [N m/A]"
-            return f"a torque without torque_constant; {wanted}"
+            return f"a torque channel without torque_constant; {wanted}"
         turned = {"pose_heading", "pose_quaternion"} & have
         if 0 < len({"pose_x", "pose_y"} & have) + len(turned) != 3:
             return (
-                "a pose in parts; expected x, y and either heading or quaternion, or none of them"
+                "an incomplete pose; expected x, y and either heading or quaternion, or none of "
+                "them"
             )
         return None
 
 
 def _pair(value: object) -> object:
-    """Return scales along x and y; one number counts for both."""
+    """Return the scales along x and y as a tuple; a single number is used for both."""
     if isinstance(value, list | tuple):
         return tuple(value)
     return None if value is None else (value, value)
@@ -149,20 +158,23 @@ class Layout(SensorLayout):
     """Layout of one type of log file.
 
     Attributes:
-        channels: columns of each channel.
-        delimiter: character between cells; not used for Parquet.
-        names_row: line with the column names, counted from 1; 0 where there is none.
-        units_row: line with the units, which are then checked; 0 where there is none.
-        first_data_row: line of the first numbers.
+        channels: columns of each channel, by the name of the channel.
+        delimiter: character between the cells of a CSV file; not used for Parquet.
+        names_row: number of the line with the column names, counted from 1; 0 if there is none.
+        units_row: number of the line with the units, which are checked against this layout; 0 if
+            there is none.
+        first_data_row: number of the first line with data, counted from 1.
         row_period: time between rows of a file without a time column [s].
-        metres_per_pixel: scale of the camera along its x and its y [m].
-        new_run: event that starts the next run inside the file.
-        drop_repeated_time: whether to keep the last of rows with the same time; else such rows are
-            refused.
-        clock: "own" for a file of poses beside a run's own whose clock is not the robot's; its
-            offset and drift are then found from the motion.
-        beside: layouts of files beside a run's own that hold more of its channels, by their names;
-            `{stem}` stands for the name of the run's own file without its suffix.
+        metres_per_pixel: length on the floor of one pixel along the x and y axes of the picture
+            [m]; one number if both are equal.
+        new_run: event that marks the start of another run in the same file.
+        drop_repeated_time: true to keep only the last of several rows with the same time; by
+            default such rows are an error.
+        clock: "own" if an additional file of poses was logged with another clock than that of the
+            robot; the offset and drift of this clock are then estimated from the motion.
+        beside: layouts of additional files in the same folder with more channels of the same run,
+            by the name of the file; `{stem}` in a name stands for the name of the run's main file
+            without its suffix.
     """
 
     channels: Mapping[str, Channel]
@@ -179,21 +191,23 @@ class Layout(SensorLayout):
 
     @property
     def columns(self) -> tuple[str | int, ...]:
-        """Return every column that the layout uses, each once."""
+        """Names or positions of all columns that the layout uses, without duplicates."""
         used = (column for channel in self.channels.values() for column in channel.columns)
         return tuple(dict.fromkeys(used))
 
     @property
     def holds(self) -> frozenset[str]:
-        """Return every channel of a run, those in files beside its own included."""
+        """Names of all channels of a run, including those in additional files."""
         beside = (name for other in self.beside.values() for name in other.channels)
         return frozenset((*self.channels, *beside))
 
     def to_si(self, channel: str) -> float:
-        """Return the factor from the channel's unit to SI; for pixels it has the camera's scale.
+        """Return the factor from the unit of a channel to SI units.
+
+        For a channel in pixels, it includes the metres per pixel.
 
         Raises:
-            ValueError: the unit does not convert, or the scale of the camera is not given.
+            ValueError: the unit cannot be converted, or `metres_per_pixel` is needed and not given.
         """
         unit, target = self.channels[channel].unit, CHANNELS[channel]
         if channel in ("pose_x", "pose_y") and converts(unit, "pixel"):

@@ -1,4 +1,4 @@
-"""Layout of a log of motors without a robot, from columns that a person or their names identify."""
+"""Layout of a log of motors on a bench, from columns named by the user or found by their names."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ from slipid.data.reading.table_format import TableFormat
 from slipid.data.reading.units import converts
 from slipid.support.errors import DataError, bad_data, did_you_mean
 
-SHAFT = 10.0
-"""Gear ratio of the layout; it is not a real one, but allows a motor shaft to turn ten times faster
-than the checks allow a wheel to."""
+SHAFT_GEAR_RATIO = 10.0
+"""Gear ratio of the layout; it is fictitious, and lets a motor shaft turn ten times faster than the
+checks allow for a wheel."""
 _CHANNELS = ("time", "voltage", "current", "motor_speed", "motor_angle", "duty", "bus_voltage")
 _INSTEAD = {"motor_speed": "motor_angle", "motor_angle": "motor_speed"}
-"""Alternative channels: each is not searched for if the other is there."""
+"""Alternative channels: a channel is not searched for if its alternative is given."""
 
 
 @dataclass(frozen=True)
 class GivenColumns:
-    """Columns of a channel, named by a person, and their unit; None for the channel's SI unit."""
+    """Columns of a channel, named by the user, and their unit; None for the channel's SI unit."""
 
     columns: tuple[str, ...]
     unit: str | None
@@ -40,12 +40,12 @@ def given_columns(text: str, channel: str) -> GivenColumns:
 def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed: bool) -> Layout:
     """Return the layout of a log of motors.
 
-    Channels without given columns take the columns whose names stand for them.
+    For channels without given columns, columns are found by their names.
 
     Args:
-        format: position of names and numbers in the file.
-        given: columns that a person named, by channel.
-        signed: whether currents have a sign.
+        format: format of the file, with the positions of names and numbers.
+        given: columns named by the user, by channel.
+        signed: True if currents have a sign.
 
     Raises:
         DataError: a given column is absent, or there is no column for time, current or speed.
@@ -81,17 +81,17 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
         delimiter=format.delimiter or ",",
         names_row=format.names_row,
         first_data_row=format.first_data_row,
-        gear_ratio=SHAFT,
+        gear_ratio=SHAFT_GEAR_RATIO,
         current_is_signed=signed,
         drop_repeated_time=True,
     )
 
 
 def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, ...]:
-    """Return the columns whose names stand for a channel; a single one for time and bus voltage.
+    """Return the columns whose names denote a channel; a single one for time and bus voltage.
 
-    Names that need an assumption are used only if there are no others, and so are names without a
-    motor's number.
+    Names that need an assumption, and names without the number of a motor, are used only if there
+    are no others.
     """
     found = {name: one for name, one in meanings.items() if one.channel == channel}
     names = [name for name, one in found.items() if not one.doubt] or list(found)
@@ -131,4 +131,7 @@ def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) 
     count = {k: len(c.columns) for k, c in channels.items() if k not in ("time", "bus_voltage")}
     if len({*count.values()}) > 1:
         listed = ", ".join(f"{k} {', '.join(map(str, channels[k].columns))}" for k in count)
-        raise DataError(f"{path}: columns for different numbers of motors ({listed}); name them")
+        raise DataError(
+            f"{path}: columns for different numbers of motors ({listed}); name the columns by "
+            "options"
+        )

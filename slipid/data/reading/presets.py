@@ -1,4 +1,4 @@
-"""Layouts of log files: presets for published formats by name, and those that a config declares.
+"""Layouts of log files: presets for published formats, and layouts declared in a config.
 
 Signs, offsets and orders of the presets were checked against the published logs, by regression of
 the wheel speeds on the twist of the tracked pose; the tests repeat this if the logs are present.
@@ -30,7 +30,7 @@ def _motors(pattern: str, unit: str) -> Channel:
 # The overhead camera of the Robotino logs has x to the right and y DOWN. X = -x, Y = y is a
 # right-handed frame seen from above, in which the heading is measured. The logged columns dx, dy
 # are not used: they are steps in the body frame at the same scale, but most steps above 5 pixels
-# are cut short in them.
+# are clipped.
 def _camera(x: str, y: str, angle: str, unit: str = "pixel") -> dict[str, Channel]:
     return {
         "pose_x": _one(x, unit, scale=-1.0),
@@ -39,8 +39,8 @@ def _camera(x: str, y: str, angle: str, unit: str = "pixel") -> dict[str, Channe
     }
 
 
-# Scale of the camera along x and y, as its owners calibrated it. Motion at this scale is too short
-# by a factor of about 1.117, which a fit estimates; the reader does not correct it.
+# Scale of the camera along x and y, as its owners calibrated it. At this scale, logged motion is
+# too short by a factor of about 1.117. A fit estimates this factor; the reader does not correct it.
 _METRES_PER_PIXEL = (1.8404619693756104e-3, 1.8371639251708984e-3)
 _ROBOTINO = Layout(
     channels={},
@@ -86,9 +86,9 @@ PRESETS = {
     # accumulate in these files, so the wheel angle is integrated from the reported speed.
     "robotino2022_motor": replace(_ROBOTINO_2022, channels=_MOTORS_2022),
     # Each row is a mean of 13 samples; a file has 204 runs, at whose start the encoders restart
-    # from 0. There is no time column: ticks over reported speed (which is 1.3 % too high) give
-    # 0.45 s between rows. Headings near 0 and 360 deg are wrong, since they are means of both; so
-    # no jump of the heading is refused.
+    # from 0. There is no time column: ticks over reported speed (which is 1.3 % too high) give 0.45
+    # s between rows. Headings near 0 and 360 deg are wrong, since they are means of both; so jumps
+    # of the heading are not treated as errors.
     "robotino2021": replace(
         _ROBOTINO,
         new_run="ticks_restart",
@@ -119,7 +119,7 @@ PRESETS = {
             "current": _motors("motor{}_current", "A"),
         },
     ),
-    # Only the camera's log: no wheel was logged in these runs. Positions are in mm along the axes
+    # Only the camera was logged in these runs, not the wheels. Positions are in mm along the axes
     # of the image.
     "robotino2021_camera": Layout(
         channels={"time": _one("time_s", "s"), **_camera("x_mm", "y_mm", "angle_deg", "mm")},
@@ -152,9 +152,9 @@ PRESETS = {
         },
     ),
 }
-"""Layouts of published log formats, by name."""
+"""Layouts of published log formats, by the name of the preset."""
 POSES = ("pose_x", "pose_y", "pose_heading", "pose_quaternion")
-"""Channels of a camera, which may have a clock of its own."""
+"""Channels of the pose, which may have been logged with another clock than the wheels."""
 _SETTINGS = [f.name for f in fields(Layout) if f.name not in ("channels", "beside")]
 
 
@@ -184,7 +184,9 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
     given = dict(table)
     others = given.pop("beside", {})
     if not isinstance(others, dict) or not all(isinstance(v, dict) for v in others.values()):
-        raise DataError(f"{where} beside: {others!r}; expected a table of layouts by file name")
+        raise DataError(
+            f"{where} beside: {others!r}; expected a table of layouts, by the names of files"
+        )
     layout = _declared_file(given, where)
     beside = dict(layout.beside)
     for name, one in others.items():
@@ -240,9 +242,11 @@ def _file_problem(layout: Layout) -> str | None:
         count = len(have["pose_quaternion"].columns)
         return f"columns.pose_quaternion: {count} columns; expected four: x, y, z and w"
     if layout.first_data_row <= max(layout.names_row, layout.units_row):
-        return f"first_data_row {layout.first_data_row}; expected it below names and units"
+        return (
+            f"first_data_row {layout.first_data_row}; expected a row below those of names and units"
+        )
     if not layout.names_row and any(isinstance(c, str) for c in layout.columns):
-        return "columns by name, but names_row is 0; expected positions from 0"
+        return "columns are given by name, but names_row is 0; expected positions counted from 0"
     return None
 
 
@@ -251,16 +255,21 @@ def _problem(layout: Layout) -> str | None:
     files = [layout, *layout.beside.values()]
     names = [name for one in files for name in one.channels if name != "time"]
     if twice := [name for name in names if names.count(name) > 1]:
-        return f"channel '{twice[0]}' in two files; expected it in one of them"
+        return f"channel '{twice[0]}' is in two files; expected it in only one of them"
     have = {name: c for one in files for name, c in one.channels.items()}
     counts = {name: len(c.columns) for name, c in have.items() if name in PER_WHEEL}
     if len(set(counts.values())) > 1:
-        return f"channels disagree on the number of wheels: {counts}; expected the same of each"
+        return (
+            f"channels have different numbers of wheels: {counts}; expected the same number in all"
+        )
     if lacking := layout.lacks(have):
         return lacking
     for name, one in [("the robot's own file", layout), *layout.beside.items()]:
         if one.clock == "own" and not set(one.channels) <= {"time", *POSES}:
-            return f"{name}: clock = 'own'; expected it for a file that has poses alone"
+            return f"{name}: clock = 'own'; allowed only for a file with poses and no other channel"
     if layout.beside and layout.new_run != "never":
-        return f"new_run = '{layout.new_run}' with files beside; expected one run for each file"
+        return (
+            f"new_run = '{layout.new_run}' together with `beside`; expected new_run = 'never', "
+            "one run per file"
+        )
     return None

@@ -26,8 +26,8 @@ from slipid.support.errors import DataError, first_names
 AnyLayout = Layout | BagLayout
 """Layout of a file of rows (CSV or Parquet) or of a bag."""
 Session = Literal["surface/load/speed", "folder", "file"]
-"""Property that the runs of one session have in common; within a session the camera's marker stayed
-in place on the robot."""
+"""Property that the runs of one session have in common; within a session the marker stayed in the
+same place on the robot."""
 
 
 def read_runs(
@@ -41,7 +41,8 @@ def read_runs(
 ) -> Runs:
     """Return every run of the files that match a glob.
 
-    Runs with another load set-up are read by another call and added: `as_built + moved`.
+    Runs with another load set-up are read by another call and added to these, as in `as_built +
+    moved`.
 
     Args:
         folder: data folder, to which the names of the runs are relative.
@@ -99,8 +100,8 @@ def read_logs(
     """Return every run in a CSV or Parquet file or in a bag.
 
     A run is left out if its pose jumps, because the marker was confused with another one or the
-    matching of scans failed, or if its poses have a clock that the motion does not determine.
-    `layout.new_run` separates the runs in a file of rows, `layout.runs` those in a bag. Parts of a
+    matching of scans failed, or if its poses have a clock that the motion does not determine. Runs
+    in a file of rows are separated by `layout.new_run`, those in a bag by `layout.runs`. Parts of a
     file with a single row show no motion and are dropped.
 
     Args:
@@ -133,7 +134,7 @@ def read_logs(
 
 
 def _table_runs(known: Identity, layout: Layout) -> list[RawRun]:
-    """Return the runs in a file of rows, with the channels of the files beside it."""
+    """Return the runs in a file of rows, with the channels of its additional files."""
     table = read_table(known.path, layout)
     if layout.drop_repeated_time:
         table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
@@ -169,13 +170,13 @@ def _parts(table: Table, layout: Layout) -> list[tuple[Table, str]]:
 
 
 def _beside(path: Path, pattern: str, layout: Layout) -> Table:
-    """Return the table of a further file of a run, which lies beside the run's own file `path`."""
+    """Return the table of an additional file of a run, in the folder of its main file `path`."""
     other = path.parent / pattern.replace("{stem}", path.stem)
     if not other.is_file():
         there = sorted(p.name for p in path.parent.iterdir() if p.is_file() and p != path)
         raise DataError(
-            f"{other}: not there; expected it beside {path.name}, as the layout says "
-            f"(there is {first_names(there, 'nothing else')})"
+            f"{other}: missing; expected in the folder of {path.name}, as declared in the layout "
+            f"(which has {first_names(there, 'nothing else')})"
         )
     return read_table(other, layout)
 
@@ -204,9 +205,10 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
 
 
 def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
-    """Return the runs' own files, without the further files of these runs that lie beside them.
+    """Return the main files of runs, without their additional files.
 
-    A glob such as `*.csv` finds both kinds; if the layout has no further files, all are returned.
+    A glob such as `*.csv` finds both kinds; if the layout has no additional files, all are
+    returned.
     """
     if isinstance(layout, BagLayout):
         return list(paths)
@@ -224,8 +226,8 @@ def _run_starts(table: Table, layout: Layout) -> list[int]:
         time = table.stacked(layout.channels["time"])[:, 0]
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
-        # In each of these runs the largest count grows in magnitude, since the robot only drives
-        # away from its start; so a decrease is a restart.
+        # In these runs the largest count only grows in magnitude, since the robot drives away from
+        # its start; so a decrease marks a restart.
         count = np.abs(table.stacked(layout.channels["wheel_ticks"])).max(axis=1)
         return [0, *(np.flatnonzero(np.diff(count) < 0) + 1).tolist()]
     return [0]
@@ -251,7 +253,9 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
         for j in np.flatnonzero(missing.any(axis=0)).tolist():
             if missing[:, j].all():
                 raise source.error("no value in any row", "numbers", column=j)
-            notes.append(f"column '{columns[j]}' has empty cells: it counts at its own times")
+            notes.append(
+                f"column '{columns[j]}' has empty cells: it is used at the times of its values"
+            )
         values = (cells * channel.scale + channel.offset) * layout.to_si(name)
         signal, there = Signal(time, values, source), ~missing.all(axis=1)
         out[name] = signal if there.all() else signal.part(there)

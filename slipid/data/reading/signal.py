@@ -1,4 +1,4 @@
-"""Samples of one channel at its own times, and runs of them, as read from a file or a bag."""
+"""Samples of one channel at the times of its sensor, and runs made of such channels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class SignalSource:
     def error(
         self, found: str, expected: str, sample: int | None = None, column: int | None = None
     ) -> DataError:
-        """Return the error about a sample, counted from 0, or (None) about all samples.
+        """Return the error about a sample, counted from 0, or, if it is None, about all samples.
 
         Args:
             found: what is wrong.
@@ -100,7 +100,7 @@ class RawRun:
 
 
 def clock_of(signals: Sequence[Signal]) -> Float[np.ndarray, " time"]:
-    """Return all times at which some of the signals was sampled, increasing, each once [s]."""
+    """Return the sorted, unique times at which any of the signals was sampled [s]."""
     first = signals[0].time
     if all(signal.time is first for signal in signals) and (np.diff(first) > 0).all():
         return first

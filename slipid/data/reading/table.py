@@ -25,12 +25,13 @@ MISSING = {"", "nan", "na", "n/a", "null", "none"}
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Numbers of one file, unchanged: no unit is converted and nothing is repaired.
+    """Numbers of one file, unchanged, without conversion of units.
 
     Attributes:
         path: path of the file.
         sha256: SHA-256 hash of the file's bytes.
-        names: names of the columns that were read; texts of their positions without names.
+        names: names of the columns that were read, or their positions as texts if they have no
+            names.
         values: numbers in the cells, NaN where a cell is empty.
         lines: line number in the file of each row of `values` (record number for Parquet), from 1.
     """
@@ -59,7 +60,7 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     Args:
         path: the file.
         layout: layout with the positions of names and numbers, and with the columns to read.
-        all_columns: whether to read all columns of the file instead of those that the layout uses.
+        all_columns: True to read all columns of the file, not only those that the layout uses.
 
     Raises:
         DataError: the file does not match the layout; the message names the file, the row or
@@ -183,14 +184,14 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 def number_in(cell: str) -> float | None:
     """Return the number in a cell, or None if the cell is not a number."""
     try:
-        # Python would read 1_000 as a thousand, which no logger writes on purpose.
+        # Python would accept 1_000 as a number, which is surely a damaged cell.
         return float(cell) if "_" not in cell else None
     except ValueError:
         return None
 
 
 def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
-    """Return the name of every column, empty where it has none; their positions without names.
+    """Return the name of every column, empty if it has none; without names, the positions as texts.
 
     Raises:
         DataError: the file ends before, another delimiter is used, or the names are numbers.
@@ -227,7 +228,7 @@ def wanted_names(
         if name not in header:
             near = get_close_matches(name, [other for other in header if other not in used], n=2)
             hint = f"did you mean {' or '.join(near)}? It has" if near else "it has"
-            expected = f"it among the names; {hint} {', '.join(filter(None, header))}"
+            expected = f"it among the column names; {hint} {', '.join(filter(None, header))}"
             raise bad_data(path, "no such column", expected, row=row, column=name)
     names = tuple(filter(None, header)) if all_columns else used
     for name in names:
@@ -271,8 +272,8 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
             at = header.index(str(column))
             written = units[at] if at < len(units) else ""
             if not same_unit(written, channel.unit):
-                found = f"the units row says '{written}'"
-                expected = f"'{channel.unit}' as the layout declares"
+                found = f"the unit in the file is '{written}'"
+                expected = f"'{channel.unit}' as declared in the layout"
                 row = layout.units_row
                 raise bad_data(path, found, expected, row=row, column=str(column))
 

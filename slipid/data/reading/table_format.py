@@ -1,4 +1,4 @@
-"""Detection of the format of a file of rows without a layout.
+"""Detection of the format of a file of rows for which no layout is known.
 
 The format is the delimiter, and the lines of names, units and numbers.
 """
@@ -26,11 +26,11 @@ from slipid.support.errors import bad_data
 ROWS = 50_000
 """Largest number of rows whose numbers are examined."""
 _DELIMITERS = (",", ";", "\t", "|", " ")
-_HEAD = 60
+_HEADER_LINES = 60
 """Number of first lines in which the header is searched."""
-_FEW = 10
-"""Least number of rows of numbers in a log; files with settings have fewer."""
-_BEGINNING = 200_000
+_LEAST_ROWS = 10
+"""Files with fewer rows of numbers are not logs but, for example, files of settings."""
+_SAMPLE_BYTES = 200_000
 """Number of first bytes of a file in which its format is searched."""
 
 
@@ -62,7 +62,7 @@ class TableFormat:
         return replace(self, path=Path())
 
     def column(self, at: int) -> str | int:
-        """Return what a layout calls a column: its name, or its position in files without names."""
+        """Return the name of a column in a layout, or its position if the file has no names."""
         return self.names[at] if self.names_row else at
 
 
@@ -94,12 +94,12 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
     if path.suffix == ".parquet":
         header = tuple(parquet_of(path, bytes_of(path)).column_names)
         return TableFormat(path, "", 1, 0, 2, header, ("",) * len(header))
-    lines = _lines(path, _BEGINNING)
+    lines = _lines(path, _SAMPLE_BYTES)
     delimiter = delimiter or _delimiter_of(lines)
-    rows = [cells_of(line, delimiter) for line in lines[:_HEAD]]
+    rows = [cells_of(line, delimiter) for line in lines[:_HEADER_LINES]]
     first = _first_numbers(rows)
     _refuse_commas(path, rows[first or 0 :], delimiter, first or 0)
-    if first is None or len(rows) - first < min(_FEW, _HEAD - first):
+    if first is None or len(rows) - first < min(_LEAST_ROWS, _HEADER_LINES - first):
         raise bad_data(path, "no rows of numbers", "a log: a row of numbers for every time")
     names_row, units_row = _header_rows(rows[:first], len(rows[first]))
     top = rows[names_row - 1] if names_row else []
@@ -142,7 +142,7 @@ def _delimiter_of(lines: list[str]) -> str:
     """
 
     def score(delimiter: str) -> tuple[float, int]:
-        counts = Counter(line.count(delimiter) for line in lines[:_HEAD] if line.strip())
+        counts = Counter(line.count(delimiter) for line in lines[:_HEADER_LINES] if line.strip())
         count, times = counts.most_common(1)[0]
         return (times / sum(counts.values()) if count else 0.0, count)
 
@@ -183,7 +183,7 @@ def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
             names = k
     if names or not units:
         return names, units
-    # Without names, written-out units that occur only once each serve as names of the columns.
+    # If there are no names, units that are written out and occur only once serve as column names.
     cells = [cell for cell in rows[units - 1] if cell]
     words = any(len(cell) > 4 and cell.isalpha() for cell in cells)
     return (units, 0) if words and len(set(cells)) == len(cells) else (0, 0)
@@ -200,7 +200,7 @@ def _refuse_commas(path: Path, body: list[list[str]], delimiter: str, first: int
     """
     if delimiter == ",":
         return
-    for k, cells in enumerate(body[:_HEAD]):
+    for k, cells in enumerate(body[:_HEADER_LINES]):
         for cell in cells:
             whole, comma, part = cell.lstrip("+-").partition(",")
             if comma and whole.isdecimal() and part.isdecimal():

@@ -46,8 +46,7 @@ KNOWN = (
 
 @lru_cache(maxsize=1)
 def _registry() -> "pint.UnitRegistry[Any]":
-    # Pint is imported here because its import takes as long as numpy's, and most commands read no
-    # log.
+    # Pint is imported here because its import is slow and most commands read no log.
     """Return pint's registry with the units above."""
     import pint
 
@@ -68,7 +67,7 @@ def factor(unit: str, target: str) -> float:
     wanted = registry.parse_units(_ALIASES.get(target, target))
     try:
         given = registry.parse_units(_ALIASES.get(unit.strip(), unit.strip()))
-    except Exception as error:  # pint raises a dozen types of errors, even one of tokenize
+    except Exception as error:  # pint raises many types of errors, even from tokenize
         known = f"{did_you_mean(unit, KNOWN)} (known: {', '.join(KNOWN)})"
         raise ValueError(f"unknown unit '{unit}'{known}") from error
     if given.dimensionality != wanted.dimensionality:

@@ -1,4 +1,4 @@
-"""Rules that turn arithmetic primitives of JAX into C: element by element, reductions, products.
+"""Rules that convert arithmetic primitives of JAX to C: element-wise, reductions, products.
 
 A product with a constant 0 is omitted from a sum of products. The result is the same for finite
 numbers, but infinity or NaN times such a 0 counts as 0, where JAX gives NaN. The words lane, row
@@ -115,7 +115,7 @@ def unary(name: str) -> Rule:
         if UNARY[name] == "{0}":
             return values[0]
         if kind_of_value(values[0]) == "int" and name not in ("neg", "square"):
-            raise NoFormError("of whole numbers")
+            raise NoFormError("for integers")
         return applied(builder, UNARY[name], kind_of(out.dtype), values, out.shape)
 
     return rule
@@ -207,7 +207,7 @@ def reduced(name: str) -> Rule:
         kind, lanes, template, first = value.kind, value.lanes, real_template, start
         if kind == "int":
             if start_of_ints is None:
-                raise NoFormError("of whole numbers")
+                raise NoFormError("for integers")
             template, first = template.replace("r_", "i_"), start_of_ints
         rest = [d for d in range(len(value.shape)) if d != value.axis]
         over = [rest.index(d) for d in axes if d != value.axis]

@@ -1,4 +1,4 @@
-"""Builder that decides in which block of code each statement of a function is placed.
+"""Builder that places each statement of a function in a block of code.
 
 Every expression is computed once, in the earliest block that has its inputs. A block is
 straight-line code or one loop over lanes (the elements along one axis of an array), so that many
@@ -86,7 +86,7 @@ class Builder:
             start: initial value of a reduction over the lanes to one number; empty for none.
         """
         lanes = lanes if start or any(map(varies, cells)) else 0
-        around = self._around(cells)
+        around = self._outermost(cells)
         if around is not self:
             around.source = self.source
             return around.compute(kind, template, cells, lanes, start)
@@ -105,7 +105,7 @@ class Builder:
 
     def array(self, kind: Kind, size: int, cells: tuple[Cell, ...], lanes: int = 0) -> Memory:
         """Return new memory, placed in the earliest block in which `cells` are available."""
-        home = self._around(cells)._place(cells, lanes)
+        home = self._outermost(cells)._place(cells, lanes)
         return Memory(f"m{self.names.number()}", kind, size, home)
 
     def fill(self, memory: Memory, template: str, cell: Cell, times: int = 0) -> None:
@@ -122,7 +122,7 @@ class Builder:
         self.blocks.append(block)
         return block
 
-    def _around(self, cells: tuple[Cell, ...]) -> Builder:
+    def _outermost(self, cells: tuple[Cell, ...]) -> Builder:
         """Return the builder for a statement that reads these cells.
 
         It is the innermost one whose repetition changes any of the cells, so that the statement is
@@ -130,7 +130,7 @@ class Builder:
         """
         if self.parent is None or self.turns is None or any(map(self._changes, cells)):
             return self
-        return self.parent._around(cells)
+        return self.parent._outermost(cells)
 
     def _changes(self, cell: Cell) -> bool:
         """Return whether a cell may have different values in two iterations of this repetition."""
@@ -146,22 +146,22 @@ class Builder:
         Loops with calls or reductions are separate from loops that a compiler can vectorize.
         """
         apart = calls and lanes > 0
-        first = max((self._after(cell, lanes) for cell in cells), default=0)
+        first = max((self._first_block(cell, lanes) for cell in cells), default=0)
         for block in self.blocks[first:]:
             if (block.lanes, block.calls) == (lanes, apart) and not block.bodies:
                 return block
         return self.append(CodeBlock(self, lanes, apart))
 
-    def _after(self, cell: Cell, lanes: int) -> int:
+    def _first_block(self, cell: Cell, lanes: int) -> int:
         """Return the index of the first block in which a statement can use a cell."""
         if isinstance(cell, At):
-            inner = 0 if cell.index is None else self._after(cell.index, lanes)
-            return max(inner, self._behind(cell.memory.home, False))
+            inner = 0 if cell.index is None else self._first_block(cell.index, lanes)
+            return max(inner, self._next_to(cell.memory.home, False))
         if not isinstance(cell, Variable):
             return 0
-        return self._behind(cell.home, lanes == cell.lanes)
+        return self._next_to(cell.home, lanes == cell.lanes)
 
-    def _behind(self, home: CodeBlock | None, together: bool) -> int:
+    def _next_to(self, home: CodeBlock | None, together: bool) -> int:
         if home is None or home.owner is not self:
-            return 0  # the memory is filled before this builder's code begins
+            return 0  # The memory is filled before the code of this builder begins.
         return home.place + (0 if together else 1)

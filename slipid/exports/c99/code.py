@@ -1,4 +1,4 @@
-"""Header and source of a control loop in C99, generated from the library's own JAX functions."""
+"""Header and source of a control loop in C99, generated from the JAX functions of the library."""
 
 from __future__ import annotations
 
@@ -139,23 +139,26 @@ def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
     """Yield sentences about axes, wheels, sensors and floors, for readers of the header."""
     robot = loop.controller.robot
     yield (
-        "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "
-        "which the start pose is given. A twist is in the body's axes."
+        "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those "
+        "of the start pose. A twist is in the body's axes."
     )
     rows = zip(robot.places.tolist(), robot.forward.tolist(), strict=True)
     for k, ((x, y), row) in enumerate(rows):
         drives = math.degrees(math.atan2(row[1], row[0]))
         yield (
-            f"Wheel {k} stands at x = {x:.4f} m, y = {y:.4f} m; turning at a positive speed it "
-            f"pushes the body towards {drives:.1f} deg."
+            f"Wheel {k} is at x = {x:.4f} m, y = {y:.4f} m; with a positive speed it pushes the "
+            f"body in the direction {drives:.1f} deg."
         )
     settings = loop.estimator.settings
-    signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
-    yield f"Currents are taken {signs}. A wheel unheard for {float(settings.stale_s):g} s is stale."
-    yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."
+    signs = (
+        "with their signs" if settings.current_is_signed else "as magnitudes (signs are ignored)"
+    )
+    stale = float(settings.stale_s)
+    yield f"Currents are used {signs}. A wheel without readings for {stale:g} s is stale."
+    yield "Floors, in the order of the columns: " + listed([*robot.labels, "none of them"]) + "."
     rows = hypotheses_of(robot).under.tolist()
     each = "; ".join(f"{k}: {' '.join(map(str, row))}" for k, row in enumerate(rows))
-    yield f"Hypotheses of the floors, as rows count them, with the floor under each wheel: {each}."
+    yield f"Hypotheses, in the order of the rows, with the floor under each wheel: {each}."
 
 
 def _comment(*parts: str) -> list[str]:

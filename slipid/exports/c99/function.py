@@ -23,8 +23,8 @@ class Argument:
     Attributes:
         name: name of the argument.
         struct: struct that the argument points to; one without a name for plain numbers.
-        read: whether the function reads the argument.
-        written: whether the function writes the argument.
+        read: True if the function reads the argument.
+        written: True if the function writes the argument.
     """
 
     name: str

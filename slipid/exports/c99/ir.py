@@ -58,8 +58,8 @@ class Memory:
         size: count of the stored numbers.
         home: block that writes the numbers; None if they are there before the function begins.
         values: bytes of a table of constants, empty for other memory.
-        scalar: whether it is a single number that C accesses without an index.
-        lanes: whether it stores one number per lane of a variable. Truth values are then stored as
+        scalar: True if it is a single number that C accesses without an index.
+        lanes: True if it stores one number per lane of a variable. Truth values are then stored as
             the numbers 1 and 0, since compilers vectorize loops over numbers of one size.
     """
 
@@ -124,12 +124,12 @@ class Statement:
     """The C statement `target = template`, with cells for the placeholders {0}, {1} and so on.
 
     Attributes:
-        target: variable that it computes; None where the template is a whole C statement.
+        target: variable that it computes; None if the template is a whole C statement.
         template: C text with placeholders for cells.
         cells: cells for these placeholders.
         writes: memory that the template writes to.
         times: iterations of a loop around this statement alone; 0 for no such loop.
-        always: whether the statement is kept even if nothing reads the memory that it writes.
+        always: True if the statement is kept even if nothing reads the memory that it writes.
         start: initial value of a reduction; empty for other statements.
         source: file and line of the Python code that the statement is generated from.
     """
@@ -153,7 +153,7 @@ class CodeBlock:
     Attributes:
         owner: builder that the block belongs to.
         lanes: number of iterations of the loop; 0 for straight-line code.
-        calls: whether the loop contains reductions or calls of C's library, see `CALLS`.
+        calls: True if the loop contains reductions or calls of C's library, see `CALLS`.
         when: condition of an if-else: if true, the first of two bodies runs, else the second.
         times: number of times that the single body of a repetition runs.
         bodies: builders of the bodies.

@@ -1,7 +1,7 @@
-"""Access to functions that JAX has traced, the same for all supported versions of JAX.
+"""Access to traced functions of JAX that is the same for all supported versions of JAX.
 
 Only this module depends on where a version of JAX stores the parameters of a primitive, the
-functions that it calls, and the line of Python code that it was traced from.
+functions that it calls, and the line of Python code from which it was traced.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class Traced:
 
     @classmethod
     def of(cls, written: object) -> Traced:
-        """Return a traced function from JAX's own object, in any supported version of JAX.
+        """Return a traced function from the object of JAX, in any supported version.
 
-        JAX 0.10 has two classes for it, later versions have one.
+        JAX 0.10 has two classes for such objects, later versions have one.
 
         Raises:
             DataError: this version of JAX represents functions in an unsupported way.
@@ -64,7 +64,7 @@ class Traced:
 
 @dataclass(frozen=True)
 class ScanParameters:
-    """Parameters of a scan, which applies a function repeatedly to its own results.
+    """Parameters of a scan, which applies a function repeatedly to its results.
 
     Attributes:
         body: the function.
@@ -119,6 +119,6 @@ def source_line(equation: JaxprEqn) -> str:
 def unknown(what: str) -> DataError:
     """Return the error that this version of JAX represents something in an unsupported way."""
     return DataError(
-        f"jax {jax.__version__} writes {what} in a way that this version of slipid does not know; "
-        f"expected a version that it knows: pip install 'jax{KNOWN}'"
+        f"jax {jax.__version__} represents {what} in a way that this version of slipid does not "
+        f"support; expected a supported version: pip install 'jax{KNOWN}'"
     )

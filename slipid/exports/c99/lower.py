@@ -56,8 +56,8 @@ RULES: dict[str, Rule] = {
 }
 """Rules that turn a primitive of JAX into C, keyed by the primitive's name.
 
-Primitives in `MOVES`, which only move numbers, have no rule here: they are applied at export to the
-indices of the elements, which shows where each element of the result comes from."""
+Primitives in `MOVES`, which only move elements, have no rule here: they are applied at export to
+the indices of the elements, which shows where each element of the result comes from."""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
 """Primitives that call another traced function, whose statements are inlined."""
 
@@ -66,9 +66,9 @@ _TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
 
 
 class UnsupportedError(DataError):
-    """Error for a function that cannot be turned into C.
+    """Error for a function that cannot be converted to C.
 
-    The message names the primitive and the line of Python code that it comes from.
+    The message gives the primitive and its line of Python code.
     """
 
 
@@ -101,7 +101,7 @@ def _results(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
         return _evaluated(equation, values)
     builder.source = source_line(equation) or builder.source
     try:
-        return _ruled(builder, equation, values)
+        return _by_rule(builder, equation, values)
     except NoFormError as error:
         known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
         raise UnsupportedError(
@@ -110,14 +110,14 @@ def _results(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
         ) from error
 
 
-def _ruled(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+def _by_rule(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Value]:
     """Return the results of an equation by the rule of its primitive."""
     primitive, params, name = equation.primitive, Params(equation), equation.primitive.name
     if name == "cond":
         return _cond(builder, params, values)
     if name == "scan":
         return _scan(builder, params, values)
-    out: Any = equation.outvars[0].aval  # jax's type hides its attributes
+    out: Any = equation.outvars[0].aval  # The type in JAX does not declare its attributes.
     shaped = Shaped(out.shape, out.dtype)
     if out.dtype not in _TYPES:
         raise NoFormError(f"numbers of type {out.dtype}")
@@ -164,7 +164,7 @@ def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
     scan = ScanParameters.of(params)
     carried, consts = scan.carried, scan.constants
     if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
-        raise NoFormError("a loop that goes through an array")
+        raise NoFormError("a scan over an array")
     body = Builder(builder.names, builder)
     body.turns = CodeBlock(builder, times=scan.turns, bodies=[body])
     begun = values[consts:]

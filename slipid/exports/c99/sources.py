@@ -54,7 +54,7 @@ class Sources:
         return self._sources[k], place - int(self._starts[k])
 
     def _cell(self, place: int) -> tuple[Cell, int]:
-        """Return the cell that has the number at a place, and the lane of the number in it."""
+        """Return the cell that contains the element at a place, and the element's lane in it."""
         source, inner = self._source(place)
         if not isinstance(source, Array):
             return Constant(source.reshape(-1)[inner].item(), kind_of(source.dtype)), 0

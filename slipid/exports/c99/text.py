@@ -19,7 +19,7 @@ class Usage:
     """Liveness analysis: which statements and arrays of a builder are used, and when.
 
     The code is scanned backwards from its end, since a statement is needed if a later one uses its
-    result. Steps are therefore counted downwards, so that an earlier step has a smaller number.
+    result. Steps are therefore counted downwards, so that an earlier step has a smaller index.
 
     Attributes:
         live: `id` of each statement that is needed.
@@ -41,7 +41,7 @@ class Usage:
         for block in reversed(builder.blocks):
             self._step -= 1
             if block.bodies:
-                self._inside(block)
+                self._mark_bodies(block)
             if block.when is not None:
                 self._uses(block.when, block)
             for statement in reversed(block.statements):
@@ -59,7 +59,7 @@ class Usage:
         for cell in statement.cells:
             self._uses(cell, block)
 
-    def _inside(self, nested: CodeBlock) -> None:
+    def _mark_bodies(self, nested: CodeBlock) -> None:
         """Mark what the bodies use; memory written before a repetition stays live until its end."""
         end = self._step
         for body in nested.bodies:
@@ -79,15 +79,15 @@ class Usage:
         if isinstance(cell, Variable):
             self._used.add(cell)
             if cell.lanes and cell.home is not block:
-                self._keep(cell.memory)
+                self._read_memory(cell.memory)
         elif isinstance(cell, At):
-            self._keep(cell.memory)
+            self._read_memory(cell.memory)
             if cell.table is not None:
                 self.read.add(cell.table.name)
             if cell.index is not None:
                 self._uses(cell.index, block)
 
-    def _keep(self, memory: Memory) -> None:
+    def _read_memory(self, memory: Memory) -> None:
         self.read.add(memory.name)
         if memory.home is not None:
             self._use_array(memory)

@@ -1,4 +1,4 @@
-"""The drive controller of ros2_controllers that has a robot's kinematics, if there is one.
+"""The drive controller of ros2_controllers with the kinematics of a robot, if there is one.
 
 Such controllers convert a body twist (vx, vy, yaw rate W) to wheel speeds by
 
@@ -23,10 +23,10 @@ from slipid.exports.ros.yaml_text import Parameter
 from slipid.robot.deployed import DeployedRobot
 
 LARGEST_DIFFERENCE = 0.05
-"""Largest difference of kinematics up to which a controller still fits a robot.
+"""Largest difference of kinematics at which a controller still fits a robot.
 
-It is the error of a rim speed as a fraction of the body's speed [1], the speed being that of points
-on the base radius where the body turns on the spot."""
+It is the error of a rim speed as a fraction of the body's speed [1], the speed is that of points on
+the base radius if the body turns on the spot."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
@@ -60,14 +60,14 @@ class DriveController:
 
 
 def drive_controller_of(robot: DeployedRobot) -> DriveController | None:
-    """Return the controller for a robot; None where no controller has its kinematics."""
+    """Return the controller for a robot; None if no controller has its kinematics."""
     found = (_mecanum(robot), _omni(robot))
     fitting = (c for c in found if c is not None and c.difference <= LARGEST_DIFFERENCE)
     return next(fitting, None)
 
 
 def joint(wheel: int) -> str:
-    """Return the name of a wheel's joint, a placeholder for the user's own."""
+    """Return a placeholder for the name of a wheel's joint."""
     return f"wheel_{wheel + 1}_joint"
 
 
@@ -161,14 +161,17 @@ def _mecanum(robot: DeployedRobot) -> DriveController | None:
 
 
 _JOINTS = (
-    "Put in your own joint names, in this order; the number is that of the wheel in robot.json and "
-    "in the logs. README.md says which joints must be reversed."
+    "Replace these by the names of your joints, in this order; the number is that of the wheel "
+    "in robot.json and in the logs. README.md lists the joints that must be reversed."
 )
 _OFFSET = (
-    "Direction in which the first of these wheels stands, from ahead [rad]: the mean over the "
-    "wheels of what their identified drive directions say."
+    "Direction from the middle to the first of these wheels, from straight ahead [rad]: the mean "
+    "over the wheels of the values computed from their identified drive directions."
 )
-_BASE = "robot.base_radius, from the middle to the wheels [m]. It has no multiplier."
-_RADIUS = "robot.wheel_radius [m]. It has no multiplier: the identified value itself stands in."
+_BASE = (
+    "robot.base_radius, from the middle to the wheels [m], the identified value. It has no "
+    "multiplier."
+)
+_RADIUS = "robot.wheel_radius [m], the identified value. It has no multiplier."
 _MIDDLE = "The origin of the body as seen from the middle of the wheels [m, m, rad]."
 _REACH = "lx + ly [m]: the mean over the wheels of their identified levers about their middle."

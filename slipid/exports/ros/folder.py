@@ -37,25 +37,26 @@ from slipid.exports.text import filled, identifiers, interval, short, table, tem
 from slipid.robot.deployed import DeployedRobot
 
 USES: Mapping[str, str] = {
-    "drive_controller.yaml": "geometry and covariances, on the worst floor, for the drive "
-    "controller: give it to the spawner or the controller manager, with your own joint names",
-    "robot_localization.yaml": "extended Kalman filter for the odometry of the drive controller, "
-    "on the worst floor: `ros2 run robot_localization ekf_node --ros-args --params-file` this file",
-    "robot_localization_slipid.yaml": "the same filter for odometry in which slip is estimated, "
-    "whoever publishes its twist, with the covariance that the file names",
+    "drive_controller.yaml": "geometry and covariances (on the worst floor) for the drive "
+    "controller: pass it to the spawner or the controller manager, after entering the names of "
+    "your joints",
+    "robot_localization.yaml": "extended Kalman filter for the odometry of that controller (on "
+    "the worst floor): `ros2 run robot_localization ekf_node --ros-args --params-file` this file",
+    "robot_localization_slipid.yaml": "the same filter for odometry with estimated slip; its "
+    "publisher must use the covariance given in the file",
     "slipid.yaml": "every number of the robot, gains and limits, as parameters of a node `slipid`",
-    "slipid_parameters.yaml": "their declaration for generate_parameter_library: types, "
-    "descriptions with verdicts, validators; the defaults are the numbers themselves",
+    "slipid_parameters.yaml": "declaration of these parameters for generate_parameter_library: "
+    "types, descriptions with verdicts, and validators; the defaults are the identified numbers",
 }
 """Use of each file, keyed by name, without the files for single floors."""
 _FLOOR = (
     "covariances of the drive controller and process noise of `robot_localization.yaml` on this "
-    "floor: give it after those files, it overrides them"
+    "floor: load it after those files, whose values it overrides"
 )
 _ENCODERS = "the drive controller, which ignores slip"
 _ESTIMATED = (
-    "slipid's estimator or another one that knows the slip of the wheels, which states this twist "
-    "covariance diagonal"
+    "slipid's estimator, or another one that estimates slip and publishes this diagonal as the "
+    "covariance of its twist"
 )
 
 
@@ -102,11 +103,11 @@ def _covariances(
     effect, slip, process = (", ".join(map(short, x)) for x in (e.effect, e.slip, e.process))
     pose = (
         f"On '{e.floor}'. Variances of x, y [m^2], z, roll, pitch, yaw [rad^2] of odometry that "
-        f"ignores slip, d = {short(DISTANCE_M)} m after its pose was last corrected: "
-        f"(effect^2 + slip^2) d^2 + process^2 d, the larger of along and across for x and y, and "
-        f"with what the heading's error carries sideways. Effect {effect}, slip {slip} (along, "
-        f"across [m/m], yaw [rad/m]), process {process} (per sqrt(m)). They are constant here "
-        f"while true ones grow with the path; wheels measure no z, roll and pitch."
+        f"ignores slip, d = {short(DISTANCE_M)} m after the last correction of its pose: "
+        "(effect^2 + slip^2) d^2 + process^2 d (for x and y, the larger value of along and "
+        f"across), plus the sideways error due to the heading. Effect {effect}, slip {slip} "
+        f"(along, across [m/m], yaw [rad/m]), process {process} (per sqrt(m)). They are constant "
+        "here, while the true ones grow with the path. Wheels do not measure z, roll and pitch."
     )
     twist = (
         f"Variances of velocities [m^2/s^2, rad^2/s^2]: (effect^2 + slip^2) v^2 + process^2 v / T "
@@ -162,7 +163,7 @@ def _controller(drive: DriveController | None) -> str:
 
 
 def _wheels(robot: DeployedRobot, drive: DriveController | None) -> list[str]:
-    """Return the table with order, places and directions of the wheels, and what to reverse."""
+    """Return the table with order, places and directions of wheels, and joints to reverse."""
     places, record = np.asarray(robot.places), robot.record
     offsets = np.broadcast_to(record.parameters["robot.drive_offset"].value, (robot.wheels,))
     order = range(robot.wheels) if drive is None else drive.wheels
@@ -214,7 +215,7 @@ def _names(robot: DeployedRobot) -> list[str]:
 
 
 def _numbers(robot: DeployedRobot) -> list[str]:
-    """Return the table with every number and its origin."""
+    """Return the table with every number and its source."""
     rows = []
     for row in number_rows(robot):
         number = (short(row.value), row.unit, interval(row.interval90))

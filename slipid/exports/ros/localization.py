@@ -1,12 +1,12 @@
 """Errors of odometry on each floor as variances for ROS messages, and filter parameters.
 
 Over a path length d [m] an error grows by a constant part (std e of the effect [m/m, rad/m]) and by
-a random part (std q of the process noise [m/sqrt(m), rad/sqrt(m)]), so that its variance is
-(e d)^2 + q^2 d. Odometry that ignores slip also has the slip of its wheels as an error: its e^2 is
-effect^2 + slip^2, where slip is the root mean square of the contact model's slip over directions of
-travel. A constant covariance does not depend on the direction of travel, so x and y both get the
-larger variance of along and across. A wrong heading moves the robot sideways; with e_w and q_w of
-the yaw this adds the variance (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
+a random part (std q of the process noise [m/sqrt(m), rad/sqrt(m)]), so that its variance is (e d)^2
++ q^2 d. Odometry that ignores slip also has the slip of its wheels as an error: its e^2 is effect^2
++ slip^2, where slip is the root mean square of the contact model's slip over directions of travel.
+A constant covariance cannot depend on the direction of travel, so x and y both get the larger
+variance of along and across. A wrong heading moves the robot sideways; with e_w and q_w of the yaw
+this adds the variance (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
 
 ROS drive controllers put one constant diagonal into every message, which is not a true covariance
 of odometry. It is computed here for the path length `DISTANCE_M`, and that of twists for the
@@ -42,7 +42,7 @@ PERIOD_S = 0.02
 UNKNOWN = 1e6
 """Variance of height [m^2], roll and pitch [rad^2], which wheels do not measure."""
 DIRECTIONS = 24
-"""Number of directions of travel over which the mean square slip is taken."""
+"""Number of directions of travel over which the squared slip is averaged."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class OdometryErrors:
         They are (e v)^2 + q^2 v / period at the speed v [m/s].
         """
         e, q = np.asarray(self.constant), np.asarray(self.process)
-        return _level((e * speed) ** 2 + q**2 * speed / period)
+        return _larger_in_plane((e * speed) ** 2 + q**2 * speed / period)
 
     def walk(self, speed: float, distance: float) -> Axes:
         """Return the variances per second of a random walk [m^2/s, m^2/s, rad^2/s].
@@ -92,7 +92,7 @@ class OdometryErrors:
         After the path length d [m] at the speed v [m/s] its std equals the constant error e d, so
         the variance per second is e^2 d v.
         """
-        return _level(np.asarray(self.constant) ** 2 * distance * speed)
+        return _larger_in_plane(np.asarray(self.constant) ** 2 * distance * speed)
 
 
 def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
@@ -137,7 +137,7 @@ def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"
     return jnp.sqrt(jnp.mean(jnp.stack([along, across, slip[..., 2]], axis=-1) ** 2, axis=1))
 
 
-def _level(row: Float[np.ndarray, "3"]) -> Axes:
+def _larger_in_plane(row: Float[np.ndarray, "3"]) -> Axes:
     """Replace the variances along and across by the larger of the two."""
     return axes_of(np.array([row[:2].max(), row[:2].max(), row[2]]))
 
@@ -167,8 +167,8 @@ def filter_parameters(
         source: description of the odometry's source, for a comment.
     """
     about = (
-        f"Odometry of {source}. Velocities only are fused: its pose is their sum, and would count "
-        "twice. Order: " + ", ".join(STATE) + "."
+        f"Odometry of {source}. Only its velocities are fused: its pose is their integral and "
+        "contains no further information. Order: " + ", ".join(STATE) + "."
     )
     return (
         Parameter("frequency", 1 / PERIOD_S, "Assumed rate of the odometry [Hz]."),
@@ -200,12 +200,12 @@ def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
     noise |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
     matrix = np.diag([noise.get(name, PLANAR_NOISE) for name in STATE])
     about = (
-        f"On '{errors.floor}'. Pose: errors that stay the same over the path, and so are no noise "
-        f"of single velocities, as a random walk with the same error after {short(DISTANCE_M)} m, "
-        f"at the highest speed of the fitted runs, {short(top_speed(robot))} m/s. Velocity: the "
-        f"change that the limit of wheel acceleration, {short(acceleration)} rad/s^2, allows "
-        f"within {short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the "
-        "rest."
+        f"On '{errors.floor}'. Pose: a random walk that replaces the errors that stay constant "
+        f"over a path, with the same error after {short(DISTANCE_M)} m at the highest speed of "
+        f"the fitted runs, {short(top_speed(robot))} m/s. Velocity: the change that the limit of "
+        f"wheel acceleration, {short(acceleration)} rad/s^2, allows within {short(PERIOD_S)} s. "
+        "Accelerations: the default of the package. The other states are held at zero by "
+        "two_d_mode."
     )
     entries = tuple(matrix.reshape(-1).tolist())
     return Parameter("process_noise_covariance", entries, about, per_line=len(STATE))
@@ -215,6 +215,6 @@ _TF = (
     "Only one node may publish this transform: set enable_odom_tf of the drive controller to false."
 )
 _DYNAMIC = (
-    "False: the pose grows uncertain while the robot stands, too. True would scale it with the "
-    "square of the speed, which ignores slow motion."
+    "False: the uncertainty of the pose also grows at standstill. True would scale the noise "
+    "with the square of the speed, which neglects slow motion."
 )

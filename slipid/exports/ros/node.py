@@ -1,4 +1,4 @@
-"""Parameters of a ROS node `slipid`: the robot's numbers, named by their paths in robot.json.
+"""Parameters of a ROS node `slipid`: the robot's parameters, named by their paths in robot.json.
 
 Names of floors and load set-ups are those of `identifiers`. Arrays per wheel are in the order of
 robot.json; matrices are in row-major order.
@@ -24,7 +24,7 @@ NODE = "slipid"
 
 
 def node_parameters(robot: DeployedRobot) -> tuple[Parameter, ...]:
-    """Return all parameters; those of a group stand together."""
+    """Return all parameters; those of a group follow one another."""
     return (*_choices(robot), *_numbers(robot), *_shape(robot), *_errors(robot), *_controls(robot))
 
 
@@ -32,7 +32,7 @@ def _choices(robot: DeployedRobot) -> Iterator[Parameter]:
     loads = [load.name for load in robot.record.loads]
     names, labels = identifiers(loads, "load"), robot.labels
     chosen = names[loads.index(robot.load_setup)]
-    about = f"load set-up for which kinematics, noise and gains are, of: {listed(loads)}"
+    about = f"load set-up to which kinematics, noise and gains apply, one of: {listed(loads)}"
     yield Parameter("load_setup", chosen, about, (Check("one_of<>", (names,)),))
     checks = _size(len(labels)), Check("unique<>", ())
     about = f"floors in the order of robot.json: {listed(labels)}"
@@ -95,7 +95,7 @@ def _shape(robot: DeployedRobot) -> Iterator[Parameter]:
     ):
         yield _flat(f"wheels.{name}", values, about, check)
     grips = tuple(bool(x) for x in wheels.grips)
-    yield Parameter("wheels.grips", grips, "whether a wheel has no rollers", (size,))
+    yield Parameter("wheels.grips", grips, "true for a wheel without rollers", (size,))
     yield _flat("kinematics.forward", robot.forward, _FORWARD, matrix)
     yield _flat("kinematics.inverse", robot.inverse, _INVERSE, matrix)
 
@@ -114,7 +114,7 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
     yield Parameter("seen.highest_current", current, _HIGHEST_CURRENT, (zero,))
     yield _flat("seen.wheel_curve", robot.wheel_curve, _CURVE, _size(2 * robot.wheels))
     for name, value in asdict(robot.record.sensors).items():
-        yield Parameter(f"seen.{name}", bool(value), f"whether it was so in the logs: {name}")
+        yield Parameter(f"seen.{name}", bool(value), f"true if this was so in the logs: {name}")
 
 
 def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
@@ -144,14 +144,14 @@ def _flat(
     return Parameter(name, tuple(np.ravel(np.asarray(values, float)).tolist()), about, checks)
 
 
-_PLACE = "where the wheels stand, x and y of each, in base radii"
+_PLACE = "centre of each wheel, x and y, in base radii"
 _DRIVE = "direction of travel of a positive wheel speed [rad], drive_offset left out"
 _ROLLER = "from the free rolling direction to the drive direction [rad]"
 _FORWARD = "J: rim speed of each wheel from vx, vy [m/s], yaw rate [rad/s], a row per wheel"
 _INVERSE = "pseudo-inverse of J: vx, vy, yaw rate from rim speeds [m/s], a row each"
 _PROCESS = "std of random errors, per root of the path length, along, across [m/sqrt(m)], in yaw"
 _EFFECT = "std of effects, the same over a path, along, across [m/m], in yaw [rad/m]"
-_CURRENT = "std of measured currents about the model's [A]"
+_CURRENT = "std of measured currents around those of the model [A]"
 _TREND = "a + b v, excess of measured currents over the model's [A, A s/m]"
 _HIGHEST_SPEED = "highest wheel speed of the fitted runs [rad/s]"
 _HIGHEST_CURRENT = "largest current of the model up to 0.8 of the highest speed [A]"

@@ -30,7 +30,8 @@ class Parameter:
     Attributes:
         name: name, with a point between the names of groups.
         value: value, which is the default in a declaration.
-        about: description in one paragraph; empty where that of the parameter before covers both.
+        about: description in one paragraph; empty if the description of the previous parameter
+            includes it.
         checks: validators of the value.
         read_only: whether it can be set only when the node starts.
         per_line: number of array entries per line; 0 for as many as fit.
@@ -56,7 +57,7 @@ _Leaf = Callable[[Parameter, str, str], Iterator[str]]
 
 
 def scalar(value: Scalar) -> str:
-    """Return a value as text that YAML 1.1 and 1.2 read back unchanged, to the last bit.
+    """Return a value as text from which YAML 1.1 and 1.2 restore it exactly.
 
     Floats get a point, and a sign in the exponent, since `1e-05` and `1.0e6` would be read as text.
     """
@@ -80,7 +81,7 @@ def comment(lines: Sequence[str]) -> list[str]:
 def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
     """Return the lines of a parameter file for some nodes, each a name with its parameters.
 
-    Parameters of a group must stand together.
+    Parameters of a group must follow one another.
     """
     lines: list[str] = []
     for node, parameters in parts:

@@ -52,13 +52,13 @@ MOST_ROUNDS = 30
 """Largest number of updates of weights, scatter and numbers."""
 SETTLED_STDS = 0.02
 """Largest change of a number in the last round of a converged fit [std]."""
-CONSTANT_S = 2e-3
+TIME_CONSTANT_STD_S = 2e-3
 """Prior std of the electrical time constant L_a / R [s]."""
 MOMENTS = (len(VOLTS) - 1, len(AMPS))
-"""Numbers of moments of the electrical and of the mechanical equation.
+"""Number of moments of the electrical and of the mechanical equation.
 
-The last signal, the sign given to unsigned currents, is an instrument in the mechanical one only.
-"""
+The last signal, the sign given to unsigned currents, is an instrument in the mechanical one
+only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class MotorFit:
         equations: the electrical equation, absent without voltage, and the mechanical one.
         correlation_time: time over which residuals are correlated [s].
         independent_times: length of the records over the correlation time.
-        converged: True if the numbers settled.
+        converged: True if the numbers converged.
         reason: sentence on how the fit ended.
         rounds: number of rounds.
     """
@@ -144,7 +144,7 @@ def fit_motor(
     scaled = [*_scaled(records, float(first.resistance)), *choices]
     space = Space(BenchRoot(BenchMotor()), scaled)
     z = space.vector(BenchRoot(first))
-    # numbers for which the user has given a start value begin there
+    # If the user has given a start value for a number, it is used.
     started = [c.pattern for c in choices if c.start is not None]
     chosen = space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in started))
     z = np.where(chosen, space.start, z)
@@ -174,7 +174,7 @@ def fit_motor(
         correlation_time=correlation_time,
         independent_times=independent_times,
         converged=settled,
-        reason=reason if settled else f"{rounds} rounds without settling",
+        reason=reason if settled else f"{rounds} rounds without convergence",
         rounds=rounds,
     )
 
@@ -187,13 +187,14 @@ def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> Benc
         found = start(volts, MOMENTS[0])
         r, c = (float(x) if x > 0 else y for x, y in zip(found, (r, c), strict=False))
         drop, slow, one = map(float, found[2:5])
-    # in unsigned currents, the ammeter's zero and friction have the same signal: it is left out
+    # With unsigned currents, the zero of the ammeter and friction have the same signal, so the zero
+    # is left out.
     k = start(amps, MOMENTS[1] if signed else MOMENTS[1] - 1)
     torque = (usual.rotor_inertia, usual.coulomb_friction, usual.viscous_friction)
     j, tau, b = (float(x) * c if x > 0 else float(y) for x, y in zip(k, torque, strict=False))
     zero = float(k[3])
     return BenchMotor(
-        # in order of declaration
+        # in the order of their declaration
         *map(jnp.asarray, (r, c, slow, drop, tau, b, j, zero, one + r * zero))
     )
 
@@ -202,7 +203,7 @@ def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
     """Return priors scaled to the motor.
 
     The stds of the meters' zeros are a tenth of the largest signals, and that of the inductance is
-    `CONSTANT_S` times the resistance.
+    `TIME_CONSTANT_STD_S` times the resistance.
     """
     amps = 0.1 * max(float(np.abs(r.current).max()) for r in records)
     chosen = [Choice("motor.current_offset", prior_mean=0.0, prior_std=max(amps, 1e-6))]
@@ -210,7 +211,7 @@ def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
     if known:
         volts = 0.1 * max(float(np.abs(u).max()) for u in known)
         chosen.append(Choice("motor.voltage_offset", prior_mean=0.0, prior_std=max(volts, 1e-6)))
-    slow = CONSTANT_S * resistance
+    slow = TIME_CONSTANT_STD_S * resistance
     return [*chosen, Choice("motor.inductance", prior_mean=0.0, prior_std=slow)]
 
 

@@ -39,10 +39,10 @@ CELL_S = 0.01
 FEWEST_TIMES = 12
 """Smallest ratio of a record's length to the estimated correlation time.
 
-Longer correlation times are not looked for, as the covariance could not be estimated from them.
-"""
+Longer correlation times are not considered, since the covariance could not be estimated then."""
 SPEEDS, CURRENTS = 6, 4
-"""Numbers of bins over speed, and over current within each bin of speed, in which misfits show."""
+"""Numbers of bins over speed, and over current within each bin of speed, for the detection of
+misfits."""
 
 Moments = Float[np.ndarray, " moment"]
 Square = Float[np.ndarray, "moment moment"]
@@ -95,7 +95,7 @@ class Equation:
 def equation(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: int) -> Equation:
     """Return an equation at given coefficients.
 
-    The first `signals` signals are the instruments, which residuals are multiplied by.
+    The first `signals` signals are the instruments, by which residuals are multiplied.
     """
     totals, halves = [], []
     for half in (0, 1):

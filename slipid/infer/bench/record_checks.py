@@ -12,15 +12,15 @@ from slipid.support.errors import DataError
 FEWEST_WINDOWS = 30
 """Smallest number of windows of an equation for a fit."""
 SURE_STDS = 5.0
-"""Size of a coefficient with the wrong sign above which its column is refused [std]."""
+"""A column is refused if a coefficient has the wrong sign and is larger than this [std]."""
 FASTEST_SHAFT = 3000.0
-"""Shaft speed that no brushed motor reaches [rad/s]."""
+"""Brushed motors do not turn faster than this [rad/s]."""
 LARGEST_POWER = 2e4
 """Power U^2 / R at standstill above which the current is assumed to be in milliamperes [W]."""
 
 
 def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool = False) -> None:
-    """Raise `DataError`, with a remedy, if the records contradict their columns' meanings.
+    """Raise `DataError`, with a remedy, if records contradict the meaning of their columns.
 
     With `unit_known` the unit of the current is not checked.
     """
@@ -28,10 +28,16 @@ def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool =
     speed = np.concatenate([r.speed for r in records])
     current = np.concatenate([r.current for r in records])
     if float(np.abs(speed).max()) > FASTEST_SHAFT:
-        _fail(where, f"the shaft turns at {np.abs(speed).max():.4g} rad/s", "its unit, rpm perhaps")
+        _fail(
+            where,
+            f"the shaft turns at {np.abs(speed).max():.4g} rad/s",
+            "its correct unit, perhaps rpm",
+        )
     if float(np.ptp(speed)) < max(6 * noise([r.speed for r in records]), REST):
         found = f"the shaft does not turn (speeds within {np.ptp(speed):.3g} rad/s)"
-        _fail(where, found, "a log in which the motor turns, both ways and at several speeds")
+        _fail(
+            where, found, "a log in which the motor turns in both directions and at several speeds"
+        )
     if np.ptp(current) == 0:
         _fail(where, f"the current is {current[0]:g} A in every row", "the motor's current")
     if all(r.signed for r in records):
@@ -39,7 +45,7 @@ def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool =
     amps, volts = mechanical(records), electrical(records, 0.0)
     if amps.usable.sum() < FEWEST_WINDOWS:
         found = f"the log has {amps.usable.sum()} short windows in which the shaft turns"
-        _fail(where, found, f"at least {FEWEST_WINDOWS}: a longer log, or more rows a second")
+        _fail(where, found, f"at least {FEWEST_WINDOWS}: a longer log, or more rows per second")
     _signs(where, records, volts, amps)
     if volts is not None and not unit_known:
         _milliamperes(where, records, volts)
@@ -56,7 +62,7 @@ def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
     negative = (current < -level).mean()
     driven = back.mean() > 0.05 and float(np.median(current[back])) > 0
     if driven and negative == 0 and current.min() > -level:
-        found = "the current is never negative, though the shaft turns both ways"
+        found = "the current is never negative, though the shaft turns in both directions"
         _fail(
             where,
             found,
@@ -72,24 +78,32 @@ def _signs(
     Current increases with acceleration because of inertia, and voltage with speed because of
     back-EMF.
     """
-    # unsigned currents were given the sign of the speed, which is no evidence of a direction
+    # Unsigned currents were given the sign of the speed, so their sign proves nothing.
     inertia = _sure(amps, 0) if all(r.signed for r in records) else 0.0
     if volts is None:
         if inertia < -SURE_STDS:
-            found = "the shaft speeds up against its current"
-            _fail(where, found, "current and speed of one sign (turn one of them: scale -1)")
+            found = "the shaft accelerates against its current"
+            _fail(
+                where,
+                found,
+                "current and speed with the same sign convention (reverse one of them: scale -1)",
+            )
         return
     along = sum(float(np.sum(r.voltage * r.speed)) for r in records if r.voltage is not None)
     back, through = _sure(volts, 1), _sure(volts, 0)
     if inertia < -SURE_STDS:
         column = "current" if along > 0 else "speed"
-        found = f"the {column} has the wrong sign: the shaft speeds up against its current"
-        _fail(where, found, f"the {column} times -1")
+        found = f"the {column} has the wrong sign: the shaft accelerates against its current"
+        _fail(where, found, f"the {column} multiplied by -1")
     if along < 0 and back < -SURE_STDS:
-        _fail(where, "the voltage has the wrong sign: it opposes the speed", "the voltage times -1")
+        _fail(
+            where,
+            "the voltage has the wrong sign: it opposes the speed",
+            "the voltage multiplied by -1",
+        )
     if back < -SURE_STDS and through > 0:
-        found = "the voltage falls with speed: voltage and current look exchanged"
-        _fail(where, found, "their columns the other way round")
+        found = "the voltage falls with speed: voltage and current seem to be exchanged"
+        _fail(where, found, "their columns exchanged")
 
 
 def _sure(w: BenchWindows, column: int) -> float:
@@ -109,6 +123,8 @@ def _milliamperes(where: str, records: Sequence[BenchRecord], volts: BenchWindow
         heat = highest**2 / found[0] / 1e3
         _fail(
             where,
-            f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, {heat:.0f} kW at standstill",
-            "the current in amperes (I:mA for mA; else I:A, or a prior of motor.resistance)",
+            f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, that is {heat:.0f} kW at "
+            "standstill",
+            "the unit of the current (I:mA for mA; if it is really A, I:A or a prior of "
+            "motor.resistance)",
         )

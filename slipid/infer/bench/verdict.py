@@ -59,7 +59,7 @@ def _worst(fit: MotorFit, equation: Equation) -> str | None:
                     f"the {equation.channel} is {abs(off):.2g} {equation.unit} "
                     f"{'above' if off > 0 else 'below'} the model's at {at.min():.3g} to "
                     f"{at.max():.3g} {unit} ({over}, {sure:.0f} stds): the motor has an effect "
-                    "that the model lacks, and intervals are wider for it"
+                    "that the model does not include; the intervals are widened accordingly"
                 )
     return sentence
 
@@ -104,20 +104,24 @@ _NUMBERS_OF = {
 }
 """Paths of the numbers that the equation of each channel determines."""
 ONE_SPEED_RATIO = 0.05
-"""Ratio of the range of speeds to the largest one below which a log has one operating point."""
+"""A log has a single operating point if its range of speeds, over the largest speed, is below
+this."""
 SLOW_ROWS_S = 1.0
-"""Time between rows above which a message asks whether its unit is right [s]."""
+"""If the time between rows is longer, a message asks whether its unit is right [s]."""
 _REMEDIES = (
-    (("motor.inductance",), "log faster, several rows in L/R, with steps of the voltage"),
-    (("motor.rotor_inertia",), "speed up and slow down, over some tenths of a second"),
+    (
+        ("motor.inductance",),
+        "log faster, with several rows per time constant L/R, and with steps of the voltage",
+    ),
+    (("motor.rotor_inertia",), "accelerate and decelerate within some tenths of a second"),
     (
         ("motor.current_offset", "motor.coulomb_friction"),
-        "turn both ways: one way only, the zero of the ammeter looks like friction",
+        "turn in both directions: otherwise the zero of the ammeter cannot be told from friction",
     ),
     (("motor.coulomb_friction", "motor.viscous_friction"), "turn steadily at several speeds"),
-    (("motor.resistance",), "let more current flow: load the shaft, or speed it up harder"),
+    (("motor.resistance",), "use larger currents: load the shaft, or accelerate it harder"),
     (("motor.back_emf",), "turn at several speeds"),
-    (("motor.brush_drop",), "let small and large currents flow, both ways"),
+    (("motor.brush_drop",), "use small and large currents, in both directions"),
     (("motor.viscous_friction",), "turn faster: at these speeds it has little effect"),
 )
 """Remedies for flat directions: the first whose quantities all occur in the direction is used."""
@@ -206,7 +210,7 @@ def _remedy(paths: Sequence[str], has_voltage: bool) -> str:
     for needed, text in _REMEDIES:
         if {*paths} >= {*needed}:
             return text
-    return "turn both ways, at several speeds, with more and less current"
+    return "turn in both directions, at several speeds, with small and large currents"
 
 
 def _too_slow(f: MotorFit) -> dict[str, str]:
@@ -223,8 +227,9 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
         if path in f.space.slices and constant < least * rows:
             about = f"about {_time(constant)}" if constant > 0.05 * rows else "far shorter"
             slow[path] = (
-                f"{path} is not identified at this rate: its time constant {name} is {about}, "
-                f"and rows are {_time(rows)} apart: log {least:g} rows or more in it"
+                f"{path} is not identified at this sampling rate: its time constant {name} is "
+                f"{about}, and rows are {_time(rows)} apart; log at least {least:g} rows per time "
+                "constant"
             )
     return slow
 
@@ -245,7 +250,7 @@ def _time(seconds: float) -> str:
 def _with_verdict(
     f: MotorFit, e: Estimate, slow: Collection[str], misfitted: Collection[str]
 ) -> Estimate:
-    """Return an estimate with a weaker verdict where the logs do not support the one it has.
+    """Return an estimate with a weaker verdict if the logs do not support its present one.
 
     Reasons are rows too far apart (`slow`), a single speed, an inductance near 0, and a misfit of
     the number's equation.
@@ -263,8 +268,8 @@ def _remarks(f: MotorFit) -> list[str]:
     found = []
     if _one_point(f):
         found.append(
-            "speed and voltage keep to one value, which determines no single number: turn at "
-            "several speeds, both ways, and speed up and slow down"
+            "speed and voltage are constant, which does not determine any number: turn at "
+            "several speeds, in both directions, and accelerate and decelerate"
         )
     if not f.has_voltage:
         found.append(
@@ -273,8 +278,9 @@ def _remarks(f: MotorFit) -> list[str]:
         )
     if not all(r.signed for r in f.records):
         found.append(
-            "currents are magnitudes: they were given the sign of the speed, windows in which the "
-            "motor may brake were left out, and the zero of the ammeter looks like friction"
+            "currents are magnitudes: they were given the sign of the speed, windows in which "
+            "the motor may brake were left out, and the zero of the ammeter cannot be told from "
+            "friction"
         )
     if f.period > SLOW_ROWS_S:
         found.append(
@@ -283,16 +289,17 @@ def _remarks(f: MotorFit) -> list[str]:
         )
     if f.correlation_time > LONG_CORRELATION_S:
         found.append(
-            f"residuals are correlated over {f.correlation_time:.2g} s: the intervals count "
-            f"{f.independent_times:.0f} independent times of that length, not the rows"
+            f"residuals are correlated over {f.correlation_time:.2g} s: the intervals are "
+            f"computed from {f.independent_times:.0f} independent times of that length, not from "
+            "all rows"
         )
     if "motor.rotor_inertia" in f.space.slices:
-        found.append("motor.rotor_inertia is that of the rotor with everything that turned with it")
+        found.append("motor.rotor_inertia includes everything that turned together with the rotor")
     return found
 
 
 def _about(f: MotorFit, misfit: list[str]) -> Content:
-    """Return how one motor was fitted, for identified.json."""
+    """Return the part of identified.json about the fit of one motor."""
     windows = [e.windows for e in f.equations]
     return {
         "rounds": f.rounds,

@@ -33,19 +33,21 @@ rows are lengthened to it, but not beyond those of the mechanical equation (`MEC
 """
 MOST_WINDOWS = 20_000
 """Largest number of windows of one record."""
-WIDER = 4
-"""Ratio of the longer window, whose mean gives the sign of a small current, to a window."""
+LONG_WINDOW_RATIO = 4
+"""Ratio of the length of longer windows, whose means give the signs of small currents, to that of
+windows."""
 GAP_RATIO = 1.5
-"""Ratio of a window's duration to its nominal one above which it spans a gap between rows."""
+"""A window spans a gap between rows if its duration exceeds the nominal one by this ratio."""
 JUMP_STDS = 6.0
-"""Step of the voltage between rows above which it counts as a jump [robust std of steps]."""
+"""A larger step of the voltage between rows counts as a jump [robust std of steps]."""
 SETTLED_S, SETTLED_ROWS = 5e-3, 4
 """Time after a jump of the voltage until currents are straight lines between rows [s], [row].
 
 The shorter of the two applies.
 """
 BRAKING_STDS = 4.0
-"""Deceleration of the shaft above which the motor may be braking [robust std of accelerations]."""
+"""The motor may be braking if the shaft decelerates by more than this [robust std of
+accelerations]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +168,10 @@ class _RecordWindows:
     def long_mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
         """Return the mean over longer windows of the same rows, whose sign is more reliable."""
         last = len(signal) - 1
-        wide = [np.clip(self._rows(WIDER * self.half, first), first, last) for first in (0, 1)]
+        wide = [
+            np.clip(self._rows(LONG_WINDOW_RATIO * self.half, first), first, last)
+            for first in (0, 1)
+        ]
         return np.stack([signal[rows].mean(axis=1) for rows in wide])
 
     def driven(self) -> Bool[np.ndarray, " window"]:

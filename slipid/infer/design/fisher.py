@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-ENDLESS = 1e3
-"""Number of repetitions of every candidate run that stands for unlimited driving."""
+UNLIMITED_REPEATS = 1e3
+"""Number of repetitions of every candidate run that represents unlimited driving."""
 
 
 class RunJacobians(NamedTuple):
@@ -122,7 +122,7 @@ class Information:
 def information_of(
     covariance: Float[np.ndarray, "free free"], is_electric: Bool[np.ndarray, " free"]
 ) -> Information:
-    """Return the information that gives this covariance of all numbers."""
+    """Return the information that corresponds to a given covariance of all numbers."""
     e, m = np.flatnonzero(is_electric), np.flatnonzero(~is_electric)
     of_motion = covariance[np.ix_(m, m)]
     motion = _inverse(of_motion)
@@ -177,7 +177,7 @@ def greedy(
 def exchanged(
     start: Information, rows: RunJacobians, goal: np.ndarray, chosen: Sequence[int]
 ) -> list[int]:
-    """Return the runs after each was replaced by the best run in its place, most useful first."""
+    """Return the runs after replacing each by the best candidate, the most useful run first."""
     kept = list(chosen)
     for k in range(len(kept)):
         others = start.plus(rows.pick(kept[:k] + kept[k + 1 :]))

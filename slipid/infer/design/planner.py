@@ -25,7 +25,7 @@ from slipid.parameter import entries
 from slipid.predict.open_loop import end_jacobian
 from slipid.search_space import Choice
 
-_TOGETHER = 256
+_RUNS_PER_CALL = 256
 """Number of runs whose Jacobians are computed in one call."""
 
 
@@ -54,7 +54,7 @@ class Planner:
         choices = [c for c in choices if any(fnmatchcase(p, c.pattern) for p in paths)]
         first = PlannedRun(robot.surfaces.labels[0], robot.body.loads[0], 0.0, 0.1)
         self._problem = Problem(
-            self._windows([first] * _TOGETHER), self.robot, choices
+            self._windows([first] * _RUNS_PER_CALL), self.robot, choices
         ).without_shared_effects()
         self.space = self._problem.space
         self.z = self.space.vector(self.robot)
@@ -80,7 +80,7 @@ class Planner:
         return steady_windows(runs, self.robot, self.channels, session)
 
     def nothing(self) -> Information:
-        """Return the information of the prior alone; marker yaws of sessions count as known."""
+        """Return the information of the prior alone; marker yaws of sessions are taken as known."""
         single = self.space.where(lambda e: e.session is not None)
         std = np.where(single, 1e-6, self.space.prior_std)
         return self._known(np.diag(std**2))
@@ -102,13 +102,14 @@ class Planner:
 
     def rows(self, runs: Sequence[PlannedRun]) -> RunJacobians:
         """Return the whitened Jacobians of every run."""
-        starts = range(0, len(runs), _TOGETHER)
-        first, *others = (self._rows(runs[k : k + _TOGETHER]) for k in starts)
+        starts = range(0, len(runs), _RUNS_PER_CALL)
+        first, *others = (self._rows(runs[k : k + _RUNS_PER_CALL]) for k in starts)
         return first.joined(*others)
 
     def _rows(self, runs: Sequence[PlannedRun]) -> RunJacobians:
-        # runs are padded to a fixed count, so that the function is compiled for one shape only
-        filled = [*runs, *[runs[-1]] * (_TOGETHER - len(runs))]
+        # The runs are padded to a fixed number, so that the function is compiled for one shape
+        # only.
+        filled = [*runs, *[runs[-1]] * (_RUNS_PER_CALL - len(runs))]
         windows = self._windows(filled)
         this = self._problem.of(windows)
         _, jacobian = this.linear(self.z, this.electric(self.z, self._log_v))
@@ -120,7 +121,7 @@ class Planner:
         wider = ((0, 0), (0, 0), (0, self.effects))
         of_motion = jnp.concatenate([jacobian["motion"], -moved], axis=2)
         jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items()} | {"motion": of_motion}
-        halves = whitened(this.noise.blocks, jacobian, self._log_v, np.ones(_TOGETHER))
+        halves = whitened(this.noise.blocks, jacobian, self._log_v, np.ones(_RUNS_PER_CALL))
         motion = np.asarray(halves.pop("motion"))[: len(runs)]
         others = [np.asarray(h)[: len(runs)] for h in halves.values()]
         electric = np.concatenate([motion[:, :0], *others], axis=1)
@@ -143,7 +144,7 @@ class Planner:
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """A quantity whose std, sqrt(tr(G cov G^T)), the proposed runs are to reduce.
+    """A quantity whose std, sqrt(tr(G cov G^T)), is to be reduced by the proposed runs.
 
     Attributes:
         name: name of the parameter or prediction.

@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 SCHEMA = "slipid.design/1"
 UNREACHABLE_RATIO = 0.9
-"""Ratio of a goal's std after unlimited driving to its present std above which it is unreachable.
-"""
+"""A goal is unreachable if unlimited driving leaves more than this ratio of its present std."""
 RANDOM_ORDERS = 8
 """Number of random orders of a grid's runs over which the criterion is averaged."""
 CURVE_POINTS = 40
 """Number of counts of runs at which the criterion of a grid is computed."""
 ASSUMPTIONS = (
-    "noise and run effects are as fitted, and each run is one observation however long it is",
-    "effects that runs in similar directions share count as each run's own",
-    "all new runs belong to one session, whose own offset they cannot average away",
+    "noise and run effects are those of the fit, and each run is one observation, whatever its "
+    "length",
+    "effects shared by runs in similar directions are treated as independent effects of each run",
+    "all new runs belong to one session, so its offset does not average out",
     "the model is linear around the fitted numbers, and fixed numbers stay fixed",
     "wheel speeds are steady: starting and stopping add no information",
     "runs start with the marker's heading at zero and are centred in the image",
-    "the marker is mounted anew for the new runs; predictions take its mean mounting",
+    "the marker is mounted again for the new runs; predictions assume its mean position",
 )
 
 
@@ -79,7 +79,7 @@ def design(scope: Scope) -> Design:
     planner = Planner.of(fit)
     candidates = scope.candidates()
     rows, now = planner.rows(candidates), planner.after(fit)
-    last = now.plus(rows, info.ENDLESS)
+    last = now.plus(rows, info.UNLIMITED_REPEATS)
     weights = _goals(scope, planner)
     lost = {g.name: s for g in weights if (s := _out_of_reach(fit, g, now, last, len(candidates)))}
     goals = [g for g in weights if g.name not in lost]
@@ -180,29 +180,31 @@ def _out_of_reach(
     part = goal.std(last) / goal.std(now)
     if part < UNREACHABLE_RATIO and not scaleless:
         return None
-    most = f"driving all {count} {info.ENDLESS:.0f} times would leave {part:.0%} of its std"
+    most = (
+        f"driving all {count} {info.UNLIMITED_REPEATS:.0f} times would leave {part:.0%} of its std"
+    )
     why = next((f.text for f in fit.flat if goal.name in f.paths), most)
-    return f"no candidate run shrinks {goal.name}: {why}"
+    return f"no candidate run reduces the std of {goal.name}: {why}"
 
 
 def _extrapolated(fit: Fit, runs: Sequence[PlannedRun]) -> list[str]:
-    """Return warnings for proposed runs outside the fitted ranges, where the law is untested."""
+    """Return warnings about proposed runs outside the fitted ranges (untested for the model)."""
     out = []
     for floor, valid in fit.validity.items():
         mine = [d for d in runs if d.surface == floor]
         turned = any(abs(t) > 1e-3 for t in valid.turn_rates)
         if not turned and any(d.turn for d in mine):
             out.append(
-                f"{floor} was never driven turning: proposed turns trust the contact law there"
+                f"no fitted run turns on {floor}: the proposed turns rely on the contact law there"
             )
         top = max(valid.speeds, default=np.inf)
         if any(d.speed > 1.05 * top for d in mine):
             out.append(
-                f"{floor} was driven at {top:g} m/s at most: faster runs trust the contact law"
+                f"fitted runs on {floor} reach {top:g} m/s: the faster runs rely on the contact law"
             )
         other = {d.load for d in mine} - set(valid.loads)
         if other:
-            out.append(f"{floor} was never driven with load {', '.join(sorted(other))}")
+            out.append(f"no fitted run on {floor} has the load {', '.join(sorted(other))}")
     return out
 
 

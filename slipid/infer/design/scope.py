@@ -22,8 +22,8 @@ def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float
     except ValueError:
         found = ()
     if not found or not np.isfinite(found).all() or min(found) < least:
-        rule = "numbers" if least < 0 else f"numbers not below {least:g}"
-        raise DataError(f"--{name} {text}: expected {rule} with commas between, as in 0,45,90")
+        rule = "numbers" if least < 0 else f"numbers of at least {least:g}"
+        raise DataError(f"--{name} {text}: expected {rule} separated by commas, as in 0,45,90")
     return tuple(dict.fromkeys(found))
 
 
@@ -31,8 +31,8 @@ def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float
 class Scope:
     """Goals and candidate runs of a proposal, by the options of `slipid design`.
 
-    An option that is not given takes the range that the fitted runs cover. A goal is a number, or a
-    prediction, whose std the new runs are to reduce.
+    The default of each option is the range covered by the fitted runs. A goal is a parameter or a
+    prediction whose std is to be reduced by the new runs.
 
     Attributes:
         fit: the fit.
@@ -63,7 +63,7 @@ class Scope:
 
     def __post_init__(self) -> None:
         if self.length is not None and not 0 < self.length < np.inf:
-            raise DataError(f"--distance {self.length:g}: expected metres above zero")
+            raise DataError(f"--distance {self.length:g}: expected a positive length in metres")
         self._known("floor", self.floors, self.fit.validity)
         self._known("load set-up", self.loads, self.fit.robot.body.loads)
 
@@ -93,7 +93,7 @@ class Scope:
     def driven_speeds(self) -> dict[str, tuple[float, ...]]:
         """Up to `MOST_SPEEDS` speeds of each floor's runs [m/s].
 
-        Where none is known, they are half and all of the largest rim speed.
+        If none is known, they are half and all of the largest rim speed.
         """
         out = {}
         for floor, valid in self.fit.validity.items():
@@ -125,8 +125,8 @@ class Scope:
         )
         return self._drivable(
             found,
-            "no candidate run is left; expected at least one heading and speed, or turning "
-            "rate, that the robot can drive",
+            "no candidate run remains; expected at least one heading and speed, or turning rate, "
+            "that the robot can drive",
         )
 
     def predicted(self, text: str) -> tuple[PlannedRun, ...]:

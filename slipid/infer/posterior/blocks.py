@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt32
 from slipid.infer.posterior.transport_map import Matrix, Transport, Warp, gaussian
 
 FORMAT = 6
-"""Version of the block files; it must change with their content or the algorithm."""
+"""Version of the block files; it must be increased if their content or the algorithm changes."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 
 
@@ -69,9 +69,10 @@ class Plan:
         ensembles: number of independent ensembles.
         walkers: number of walkers of each.
         block: number of steps in a block.
-        warm_up: counts of blocks after which proposals are learnt; the last ends the warm-up and
-            leaves blocks in which the step of Hamiltonian moves adapts to the last proposals.
-        most: number of blocks after which sampling ends without convergence.
+        warm_up: numbers of blocks after which proposals are learnt; the last one is the end of the
+            warm-up. Some blocks before it let the step of Hamiltonian moves adapt to the last
+            proposals.
+        most: number of blocks after which sampling ends even without convergence.
         spread: distance of the widest walker's start from the fit [std]; the first walker starts
             at a quarter of it. Wide starts find modes away from the fit.
         r_hat: upper limit of R-hat over ensembles for every coordinate.
@@ -94,7 +95,9 @@ class Plan:
     def __post_init__(self) -> None:
         if self.most <= self.warm_up[-1]:
             least = self.warm_up[-1] + 1
-            raise ValueError(f"{self.most} blocks; expected {least} or more, past the warm-up")
+            raise ValueError(
+                f"{self.most} blocks; expected at least {least}, more than the warm-up"
+            )
 
 
 @dataclass(frozen=True, eq=False)

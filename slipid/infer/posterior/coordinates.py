@@ -18,7 +18,7 @@ from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
 """Parts of a posterior that have a density: motion, electric numbers given motion, all numbers."""
-_TURNS = 3
+_ROUNDS = 3
 """Number of alternations between weights of runs and shared effects at the fit."""
 
 
@@ -71,7 +71,7 @@ def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.nd
     """Return the shared effects at a fit, estimated by turns with the weights of runs."""
     keep = np.ones(len(problem.windows))
     effect = np.zeros((len(keep), 3))
-    for _ in range(_TURNS):
+    for _ in range(_ROUNDS):
         weighed = problem.weighed(residual, log_v, keep, effect)
         root = weighed.whitening.root["motion"]
         effect = np.asarray(effects_given(weighed.effects, root, residual["motion"]))

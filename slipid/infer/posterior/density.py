@@ -106,7 +106,7 @@ class Density:
             def each(anchor: Anchor, many: tuple[Any, ...]) -> Result:
                 return jax.lax.map(lambda one: of(form, anchor, *one), many)
 
-            # stored here since JAX's own cache of compiled functions would never free it
+            # Stored here, since the cache of JAX for compiled functions would never free it.
             form._each[of] = jax.jit(each)
         found: Result = form._each[of](self.anchor, many)
         return found
@@ -138,7 +138,7 @@ class Density:
         camera, spread = lk.log_jacobians(found.robot, b, anchor.noise(found.robot))
         for k, r in found.residuals.items():
             white, more = anchor.white(k, r), jnp.zeros(len(r))
-            less = expected(r.shape[-1])  # f, so that the mode is that of the fit
+            less = expected(r.shape[-1])  # The factor f makes the mode equal to that of the fit.
             if k == "motion":
                 more = less * camera
                 for floor, posterior in enumerate(anchor.effects):
@@ -228,8 +228,8 @@ _STEPS, _PROPOSALS = 4, 16
 """Numbers of Gauss-Newton steps and of proposals for every draw of the motion."""
 _DEGREES = 5.0
 """Degrees of freedom of the Student t from which electric numbers are proposed."""
-_WIDER = 1.15
-"""Ratio of the proposals' scale to that of the Gaussian around the most likely values."""
+_SCALE_RATIO = 1.15
+"""Ratio of the scale of the proposals to that of the Gaussian around the most likely values."""
 
 
 def electric_given_motion(
@@ -271,8 +271,8 @@ def _draw(
 ) -> tuple[Array, Array]:
     """Return the last accepted proposal, and a mask of the accepted proposals.
 
-    `start` is where Gauss-Newton steps begin, `student` are standard draws of a Student t, and
-    `chance` log uniform numbers.
+    `start` is the start of the Gauss-Newton steps, `student` has standard draws of a Student t, and
+    `chance` has logarithms of uniform random numbers.
     """
 
     def log_prob(x: Array) -> Array:
@@ -286,10 +286,10 @@ def _draw(
         return x + jnp.linalg.solve(information(x), jax.grad(log_prob)(x)), None
 
     found, _ = jax.lax.scan(step, start, None, length=_STEPS)
-    # divergent steps end in nan; proposals are then made around the start, where few are accepted
+    # Divergent steps end in nan; proposals are then made around the start, and few are accepted.
     centre = jnp.where(jnp.all(jnp.isfinite(found)), found, start)
     root = jnp.linalg.cholesky(jnp.linalg.inv(information(centre)))
-    at = centre + _WIDER * student @ root.T
+    at = centre + _SCALE_RATIO * student @ root.T
     tail = 0.5 * (_DEGREES + len(start)) * jnp.log1p(jnp.sum(student**2, axis=1) / _DEGREES)
     log_ratio = jax.vmap(log_prob)(at) + tail
     log_ratio = jnp.where(jnp.isfinite(log_ratio), log_ratio, -jnp.inf)

@@ -1,7 +1,7 @@
 """Draws of a posterior, the estimates from them, and the convergence of its chains.
 
-The module does not import the sampler; modules that show, deploy or write a posterior are loaded by
-the methods that need them.
+The module does not import the sampler; modules for showing, deploying and writing a posterior are
+loaded by the methods that need them.
 """
 
 from dataclasses import dataclass, replace
@@ -55,10 +55,10 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Posterior of a fit; `print` shows its numbers and whether the chains agree.
+    """Posterior of a fit; `print` shows its numbers and the convergence of its chains.
 
     Attributes:
-        fit: fit that the chains started around.
+        fit: fit around which the chains were started.
         z: draws of the search vector.
         log_variance: draws of the log variances.
         log_prob: log density of the numbers that were sampled by chains: all of them, or those of
@@ -149,7 +149,7 @@ class Posterior:
         return deploy(self)
 
     def save(self, path: Path | str) -> None:
-        """Write posterior.nc, whole or not at all."""
+        """Write posterior.nc completely or not at all."""
         from slipid.infer.posterior import sample as netcdf
 
         netcdf.write(self.tree, Path(path))

@@ -45,7 +45,7 @@ def extended(
     while checkpoint and (arrays := checkpoint.load(f"{part}-{len(blocks):04d}")) is not None:
         blocks.append(unpacked(arrays))
     if checkpoint and blocks:
-        report.line(f"going on from block {len(blocks)} ({part}) of {checkpoint.folder}")
+        report.line(f"continuing from block {len(blocks)} ({part}) of {checkpoint.folder}")
     report.stage(f"sampling {part}")
     while not _ended(blocks, plan):
         block = _block(target, plan, blocks)
@@ -58,7 +58,9 @@ def extended(
             f"{100 * block.accepted.mean():.0f} % moved, "
             f"log density {block.log_prob[:, -1].mean():.1f}"
         )
-        report.advance(len(blocks), plan.most, what)  # the remaining time is that to the limit
+        report.advance(
+            len(blocks), plan.most, what
+        )  # The remaining time is estimated up to the limit of blocks.
     return blocks
 
 
@@ -66,7 +68,7 @@ def _ended(blocks: list[ChainBlock], plan: Plan) -> bool:
     after = len(blocks) - plan.warm_up[-1]
     if len(blocks) >= plan.most:
         return True
-    # the check takes time: it is done for every fourth block at first, then less often
+    # The check is slow, so it is done for every fourth block at first, and later less often.
     if after < 4 or after % max(4, 2 ** int(np.log2(after) - 3)):
         return False
     return diagnosis.diagnose(chain(blocks, plan), plan).converged
@@ -169,7 +171,7 @@ def _start(target: LogDensity, plan: Plan, ensemble: int) -> tuple[np.ndarray, R
             state = random.get_state(legacy=True)
             assert isinstance(state, tuple)
             return x, state
-    raise ValueError("the log density is not finite anywhere near the fit")
+    raise ValueError("the log density is not finite at any point near the fit")
 
 
 def _with_learnt(

@@ -42,8 +42,7 @@ _FINITE = 1e100
 STEEPEST = 50.0
 """Largest change of momentum in a Hamiltonian step.
 
-It keeps walkers in steep tails from being carried far away.
-"""
+Without this limit, walkers in steep tails could move very far away."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
     """Return the log density of independence proposals, up to a constant."""
     size, q = u.shape[1], (u**2).sum(axis=1)
     of_t = gammaln(0.5 * (DEGREES + size)) - gammaln(0.5 * DEGREES)
-    of_t -= 0.5 * size * np.log(DEGREES / 2)  # less the Gaussian's 2 pi
+    of_t -= 0.5 * size * np.log(DEGREES / 2)  # without the factor 2 pi of the Gaussian
     of_t -= 0.5 * (DEGREES + size) * np.log1p(q / DEGREES)
     return np.asarray(np.logaddexp(np.log(1 - STUDENT) - 0.5 * q, np.log(STUDENT) + of_t))
 
@@ -216,7 +215,7 @@ class Hamiltonian(FamilyMove):
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
         count, places = len(x), self.family.places
-        # at times there are more and shorter steps, for walkers where the density is steep
+        # Some moves have more and shorter steps, for walkers in steep parts of the density.
         h = self.angle * SHORTEST ** (random.uniform() ** 3)
         steps = int(np.clip(random.uniform(0.7, 1.3) * QUARTER_TURN / h + 0.5, 1, MOST_STEPS))
         h *= random.uniform(0.8, 1.0, (count, 1))

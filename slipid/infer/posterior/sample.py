@@ -36,10 +36,12 @@ from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
 for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
-    importlib.import_module(_module)  # a missing package must fail here, not after hours
+    importlib.import_module(
+        _module
+    )  # A missing package must be reported here, not after hours of sampling.
 
-MOST_STILL = 0.01
-"""Largest fraction of draws whose electric numbers have no accepted proposal."""
+MOST_UNMOVED = 0.01
+"""Largest accepted fraction of draws whose electric numbers have no accepted proposal."""
 
 
 def sampled(
@@ -73,8 +75,8 @@ def sampled(
             still = float((~moved.any(axis=1)).mean())
     if not np.isfinite(out).all():
         still, reason = 1.0, "electric draws that are not finite"
-    elif found.converged and still > MOST_STILL:
-        reason = f"{100 * still:.1f} % of the electric draws, which never moved"
+    elif found.converged and still > MOST_UNMOVED:
+        reason = f"{100 * still:.1f} % of the electric draws, which had no accepted proposal"
     return Posterior(
         fit=fit,
         z=out,
@@ -83,7 +85,7 @@ def sampled(
         names=first.names,
         diagnosis=found,
         accepted=accepted,
-        converged=found.converged and still <= MOST_STILL,
+        converged=found.converged and still <= MOST_UNMOVED,
         reason=reason,
     )
 
@@ -227,7 +229,7 @@ def _data(
 ) -> tuple[dict, dict, dict]:
     """Return the measurements of every window, their replicates, and their dimensions, by name.
 
-    `new` holds replicates less measurements. Marker increments are in metres corrected by the
+    `new` contains replicates less measurements. Marker increments are in metres corrected by the
     fitted camera.
     """
     w = problem.windows

@@ -32,19 +32,19 @@ Matrix = Float[np.ndarray, "_ _"]
 Vector = Float[np.ndarray, " _"]
 Leaf = Array | np.ndarray
 """A NumPy array while a map is learnt, a JAX array in the inverse map."""
-FLAT_FROM = 4.0
+POLYNOMIAL_LIMIT = 4.0
 """Size of a whitened coordinate w beyond which polynomials are constant [std]."""
-SQUARED = 5
+SQUARED_COORDINATES = 5
 """Number of coordinates of a group, with the largest variances, whose squares and products are
 monomials."""
-CUBED = 3
+CUBED_COORDINATES = 3
 """Number of coordinates of a group, with the largest variances, whose cubes are monomials."""
-WORTH_NATS = 3.0
+LEAST_GAIN_NATS = 3.0
 """Smallest gain in log likelihood for which a monomial is included [nat]."""
 MOST_MONOMIALS = 12
 """Largest number of monomials added for a coordinate, in its mean and log std together."""
 MOST_DRAWS = 4000
-"""Largest number of draws that a map is learnt from."""
+"""Largest number of draws from which a map is learnt."""
 
 
 @jax.tree_util.register_dataclass
@@ -151,7 +151,7 @@ class Transport:
         size, v = x.shape[1], np.empty_like(x)
         columns = np.concatenate([np.zeros_like(x), x - self.mean, np.ones((len(x), 1))], axis=1)
         for i, slope, root, factors, shift, scale in zip(*self.steps, strict=True):
-            f = np.clip(columns[:, factors], -FLAT_FROM, FLAT_FROM).prod(axis=2)
+            f = np.clip(columns[:, factors], -POLYNOMIAL_LIMIT, POLYNOMIAL_LIMIT).prod(axis=2)
             w = (columns[:, size + i] - columns @ slope) * np.exp(-root)
             v[:, i] = (w - f @ shift) * np.exp(-f @ scale)
             columns[:, i] = w
@@ -184,7 +184,7 @@ def _placed(map: Transport, u: Array) -> tuple[Array, Array]:
 
     def step(columns: Array, s: _Step) -> tuple[Array, tuple[Array, Array]]:
         i, slope, root, factors, shift, scale = s
-        f = jnp.clip(columns[:, factors], -FLAT_FROM, FLAT_FROM).prod(axis=2)
+        f = jnp.clip(columns[:, factors], -POLYNOMIAL_LIMIT, POLYNOMIAL_LIMIT).prod(axis=2)
         spread = f @ scale
         columns = columns.at[:, i].set(f @ shift + jnp.exp(spread) * v[:, i])
         about = columns @ slope
@@ -214,11 +214,16 @@ def _monomials(
     size = w.shape[1]
     one = size  # the column of ones
     every = [(one, one, one)] + [(k, one, one) for k in range(size)]
-    squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
+    squared, cubed = (
+        range(min(SQUARED_COORDINATES, size - 1)),
+        range(min(CUBED_COORDINATES, size - 1)),
+    )
     every += [(*pair, one) for pair in combinations_with_replacement(squared, 2)]
     every += [(k, k, k) for k in cubed]
     of_each = np.array(every)
-    columns = np.concatenate([np.clip(w, -FLAT_FROM, FLAT_FROM), np.ones((len(w), 1))], axis=1)
+    columns = np.concatenate(
+        [np.clip(w, -POLYNOMIAL_LIMIT, POLYNOMIAL_LIMIT), np.ones((len(w), 1))], axis=1
+    )
     f = columns[:, of_each].prod(axis=2)
     reach = np.where(of_each >= size, -1, of_each).max(axis=1)
     factors = np.full((size, MOST_MONOMIALS + 1, 3), one)
@@ -236,7 +241,7 @@ def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]
     """Return coefficients of the mean and of the log std of w given monomials f, most of them zero.
 
     Monomials are included one by one, in order of their score statistics, as long as the next one
-    gains more than `WORTH_NATS` nats for `effective` independent rows.
+    gains more than `LEAST_GAIN_NATS` nats for `effective` independent rows.
     """
     shift, scale, means, spreads = np.zeros(f.shape[1]), np.zeros(f.shape[1]), [0], [0]
     share = effective / len(w)
@@ -254,7 +259,7 @@ def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]
         of_mean = _scores(f * root[:, None], means, root * (w - f @ shift))
         gains = share * np.stack([0.5 * of_mean, 0.25 * _scores(f, spreads, excess)])
         which, best = np.unravel_index(np.argmax(gains), gains.shape)
-        if gains[which, best] < WORTH_NATS:
+        if gains[which, best] < LEAST_GAIN_NATS:
             break
         (means, spreads)[which].append(int(best))
     return shift, scale

@@ -1,17 +1,17 @@
 """Overall judgement of a fit: floors that disagree about the wheel loads, and trust in the fit.
 
-Each floor has load biases of its own (`slipid.model.contact_law`). Their prior is estimated from
-all floors and keeps them near zero; the intervals of the loads take this prior into account. The
-test for disagreement removes it. With L the precision of the fit, P0 the part of L from this prior,
-and P1 the precision of an uninformative prior, the search vector z, relative to its prior mean,
-changes by
+Each floor has separate load biases (`slipid.model.contact_law`). Their prior is estimated from all
+floors and keeps them near zero; the intervals of the loads take this prior into account. The test
+for disagreement removes it. With L the precision of the fit, P0 the part of L from this prior, and
+P1 the precision of an uninformative prior, the search vector z, relative to its prior mean, changes
+by
 
     d = (L + P1 - P0)^-1 (P0 - P1) z
 
 and the difference of two floors' biases, squared and divided by its covariance, is a chi-square
 variable if the contact law holds for both.
 
-A fit is trusted if it converged, predicts its runs, and has the numbers of a physical robot.
+A fit is trusted if it converged, predicts its runs, and has physically plausible numbers.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -31,7 +31,7 @@ from slipid.support.content import Content
 
 LARGEST_P_VALUE = 0.01
 """Largest p-value at which a disagreement is reported."""
-_WIDE = 1.0
+_UNINFORMATIVE_STD = 1.0
 """Std of the uninformative prior of load biases."""
 
 
@@ -46,7 +46,10 @@ def disputes(space: Space, z: Search, covariance: Square) -> dict[tuple[str, str
     if len(bias) < 2:
         return {}
     at = np.concatenate([np.arange(p.start, p.stop) for p in bias.values()])
-    precision, less = np.linalg.inv(covariance), 1 / space.prior_std[at] ** 2 - 1 / _WIDE**2
+    precision, less = (
+        np.linalg.inv(covariance),
+        1 / space.prior_std[at] ** 2 - 1 / _UNINFORMATIVE_STD**2,
+    )
     precision[at, at] -= less
     wide = np.linalg.inv(precision)
     separate = np.asarray(z) + wide[:, at] @ (less * (np.asarray(z) - space.prior_mean)[at])
@@ -75,10 +78,11 @@ def marked(
 
 Word = Literal["trusted", "doubtful", "not to be trusted"]
 WORDS: tuple[Word, ...] = ("trusted", "doubtful", "not to be trusted")
-WORSE, MUCH_WORSE = 1.1, 1.5
-"""Ratios of the model's to the encoders' error above which a fit is doubtful, not to be trusted."""
+DOUBTFUL_RATIO, UNTRUSTED_RATIO = 1.1, 1.5
+"""Ratios of the error of the model to that of the encoders above which a fit is doubtful, or not to
+be trusted."""
 SMALL_ERROR = 0.005
-"""Difference of model's and encoders' end-point errors over path length that does not count."""
+"""Difference of the end-point errors of model and encoders, over path length, that is ignored."""
 USELESS_ERROR = 0.5
 """End-point error over path length above which a model is useless."""
 MANY_AT_BOUNDS = 3
@@ -159,7 +163,7 @@ def verdict_of_trust(
     """Return the trust in a fit, by its worst aspect: errors, convergence or fitted numbers.
 
     Args:
-        floors: errors by floor, of held-out runs where there are any.
+        floors: errors by floor, of held-out runs if there are any.
         converged: True if the fit converged.
         parameters: every number of the fit.
         runs: number of predicted runs.
@@ -181,12 +185,12 @@ def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
     for name, e in floors.items():
         both = f"{100 * e.model:.1f} % of the path, encoders alone by {100 * e.encoders:.1f} %"
         if not isfinite(e.model):
-            yield (2, f"on {name} its predictions are not numbers")
-        elif e.model > e.encoders + SMALL_ERROR and e.model > WORSE * e.encoders:
-            much = e.model > MUCH_WORSE * e.encoders and e.model > e.encoders + 4 * SMALL_ERROR
-            yield (2 if much else 1, f"on {name} it is off by {both}")
+            yield (2, f"on {name} its predictions are not finite numbers")
+        elif e.model > e.encoders + SMALL_ERROR and e.model > DOUBTFUL_RATIO * e.encoders:
+            much = e.model > UNTRUSTED_RATIO * e.encoders and e.model > e.encoders + 4 * SMALL_ERROR
+            yield (2 if much else 1, f"on {name} its predictions are off by {both}")
         elif e.model > USELESS_ERROR:
-            yield (1, f"on {name} it is off by {both}: neither is of use there")
+            yield (1, f"on {name} its predictions are off by {both}: neither is useful there")
 
 
 def _of_numbers(numbers: list[Estimate]) -> Iterator[_Reason]:
@@ -196,7 +200,10 @@ def _of_numbers(numbers: list[Estimate]) -> Iterator[_Reason]:
             value = np.atleast_1d(np.asarray(e.value, float))
             if fnmatchcase(e.path, pattern) and not ((value >= low) & (value <= high)).all():
                 worst = float(value[np.argmax(np.abs(value))])
-                yield (2, f"{e.path} = {worst:.3g} {e.unit}; plausible are {low:g} to {high:g}")
+                yield (
+                    2,
+                    f"{e.path} = {worst:.3g} {e.unit}; plausible values are {low:g} to {high:g}",
+                )
     bounds = [e.path for e in numbers if e.verdict == "at_bound"]
     if bounds:
         level = 2 if len(bounds) >= MANY_AT_BOUNDS else 1

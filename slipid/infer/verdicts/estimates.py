@@ -21,8 +21,7 @@ FROM_ZERO = 3.0
 """Smallest ratio of an identified positive number to its std.
 
 The likelihood of a number closer to 0 is flat towards 0, even if its logarithm has a narrow
-interval.
-"""
+interval."""
 AT_ZERO_STDS, AT_ZERO_RATIO = 4.0, 0.05
 """Limits for a positive number that counts as being at its bound 0.
 
@@ -32,8 +31,7 @@ that mean. The second condition excludes numbers with a narrow prior that the da
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Numbers that are not identified without voltages.
 
-Without voltages their scale is determined by priors of other numbers only.
-"""
+Without voltages their scale is determined only by the priors of other numbers."""
 Z95 = 1.6448536269514722
 """The 95 % quantile of a standard Gaussian."""
 LARGEST_LOG = 600.0
@@ -55,15 +53,14 @@ RATIOS: Mapping[tuple[str, str], Declaration] = {
         "1/m", "all that motion without slip determines"
     ),
 }
-"""Quotients of a quantity and a number, which have a verdict of their own if both are free.
+"""Quotients of a quantity and a number, which get a separate verdict if both are free.
 
-They may be identified where neither of the two is. If floors have values of the quantity of their
-own, there is a quotient for every floor.
+A quotient may be identified even if neither number is. If the quantity has a value for each floor,
+there is a quotient for every floor.
 
 The resistance occurs in the voltage equation only: contact forces determine the motion of the body,
 and with the torque constant they determine the currents. Without voltages not even R / C_e is
-identified, in contrast to models that compute slip from R I^2 + C_e I wm.
-"""
+identified, in contrast to models that compute slip from R I^2 + C_e I wm."""
 
 
 @dataclass(frozen=True, kw_only=True)

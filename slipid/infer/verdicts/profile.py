@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 RISE = float(chi2.ppf(0.9, 1)) / 2
 """Rise of minus log likelihood, above its minimum, at the ends of the 90 % interval."""
-_ENOUGH, _TOO_FAR = 1.5 * RISE, 3 * RISE
-"""Rise at which one side of a profile is complete, and rise above which the last step was too long
-if the point before it lies within the interval."""
-_FAR = 3.0
-"""Largest distance from the prior mean to which a side is followed [prior std]."""
-_LEAST, _MOST = 0.1, 24
+_COMPLETE_RISE, _LARGEST_RISE = 1.5 * RISE, 3 * RISE
+"""Rise at which one side of a profile is complete, and largest rise of its last point: if it is
+exceeded and the point before lies within the interval, the last step is halved."""
+_FARTHEST = 3.0
+"""Largest distance from the prior mean up to which a side is computed [prior std]."""
+_SHORTEST_STEP, _MOST_POINTS = 0.1, 24
 """Shortest step that is still halved [Laplace std], and largest number of points on a side."""
 
 
@@ -56,9 +56,9 @@ class Profile:
         laplace: D at each value by the Laplace approximation, conditional on `given`.
         estimate: value of the fit [unit].
         interval90: 90 % interval of the likelihood, None for the end of an open side [unit].
-        ends: kind of each side: `closed`, `open` (the likelihood does not fall to the end of the
-            interval within the range followed) or `at_bound` (the same, but the number's bound ends
-            the interval).
+        ends: kind of each side: `closed`, `open` (the likelihood does not fall to the level of the
+            interval's end within the computed range) or `at_bound` (the same, but the number's
+            bound ends the interval).
         given: numbers that were fixed at the fit's values, as text; empty if all were refitted.
         settled: True if every refit converged.
         sentence: result in one sentence for people.
@@ -98,7 +98,7 @@ def profiled(space: Space, path: str) -> Entry:
         why = {e.path: f"{path} is fixed" for e in space.all}
         why |= {e.path: f"{path} has {e.size} numbers" for e in space.free}
         reason = why.get(path, f"no parameter '{path}'")
-        raise ValueError(f"{reason}; a profile is of one free number: {', '.join(can)}")
+        raise ValueError(f"{reason}; expected one free number: {', '.join(can)}")
     return can[path]
 
 
@@ -150,7 +150,7 @@ def profile(
         given="" if problem.objective.joint or refits.of_motion else "the motion as fitted",
         settled=refits.settled,
         sentence=_sentence(entry, interval, ends, problem.windows.has_voltage)
-        + ("" if refits.settled else "; some refits did not settle: it may be wider"),
+        + ("" if refits.settled else "; some refits did not converge: the interval may be wider"),
     )
 
 
@@ -193,7 +193,8 @@ class _Refits:
     def side(self, sign: float) -> list[tuple[float, float]]:
         """Return points (coordinate, loss) from the estimate outward, downward for sign -1.
 
-        A side ends where the loss has risen by `_ENOUGH`, or `_FAR` from the prior mean.
+        A side ends where the loss has risen by `_COMPLETE_RISE`, or `_FARTHEST` from the prior
+        mean.
         """
         points: list[tuple[float, float]] = []
         state, step, before = self.state, 0.5 * self.std, 0.0
@@ -202,9 +203,9 @@ class _Refits:
             self.problem.space.prior_std[self.at],
         )
         base = self.lowest - 0.5 * ((self.start - mean) / prior_std) ** 2
-        reach = max(sign * mean + _FAR * prior_std, sign * self.start + _FAR * self.std)
+        reach = max(sign * mean + _FARTHEST * prior_std, sign * self.start + _FARTHEST * self.std)
         growth = 1.5
-        while len(points) < _MOST:
+        while len(points) < _MOST_POINTS:
             z = np.array(state.z)
             z[self.at] += sign * step
             if sign * z[self.at] > reach:
@@ -219,10 +220,10 @@ class _Refits:
             rise = loss - 0.5 * ((z[self.at] - mean) / prior_std) ** 2 - base
             self.count += 1
             self.progress(self.count, rise)
-            if rise > _TOO_FAR and before < RISE and step > _LEAST * self.std:
+            if rise > _LARGEST_RISE and before < RISE and step > _SHORTEST_STEP * self.std:
                 step, growth = 0.5 * step, 1.0
                 continue
-            if rise > _ENOUGH:
+            if rise > _COMPLETE_RISE:
                 break
             if rise - before < 0.2 * RISE:
                 step *= growth
@@ -231,7 +232,7 @@ class _Refits:
 
 
 def _crossing(z: np.ndarray, rise: np.ndarray) -> float | None:
-    """Return the first value, going outward, at which the rise is `RISE`, None if it stays below.
+    """Return the first value outward at which the rise is `RISE`, None if it stays below.
 
     The rise is interpolated by a monotone cubic.
     """
@@ -251,15 +252,21 @@ def _sentence(
     low, high = (None if x is None else f"{x:.4g}{unit}" for x in interval)
     if "at_bound" in ends:
         side = f"below {high}" if ends[0] == "at_bound" else f"above {low}"
-        return f"{entry.path} is at its bound: the data only put it {side} (90 %)"
+        return f"{entry.path} is at its bound: the data only show that it is {side} (90 %)"
     if low is None and high is None:
         return (
-            f"{entry.path}: the data do not determine it, "
-            "their likelihood is level across the prior"
+            f"{entry.path}: the data do not determine it; the likelihood is nearly constant over "
+            "the prior"
         )
     if entry.path in NEEDS_VOLTAGE and not has_voltage:
-        return f"{entry.path}: no voltage is logged, its limits come from other numbers' priors"
+        return (
+            f"{entry.path}: no voltage is logged, so its limits come from the priors of other "
+            "numbers"
+        )
     if low is None or high is None:
         side = f"below {high}" if low is None else f"above {low}"
-        return f"{entry.path}: the data only put it {side} (90 %), the other side is level"
-    return f"{entry.path}: the data put it between {low} and {high} (90 %)"
+        return (
+            f"{entry.path}: the data only show that it is {side} (90 %); the likelihood has no "
+            "other limit"
+        )
+    return f"{entry.path}: between {low} and {high} by the data (90 %)"

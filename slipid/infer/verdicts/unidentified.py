@@ -22,8 +22,8 @@ from slipid.infer.verdicts.wording import NOTHING, OTHERS_CHANGE, Axis, axes_of,
 from slipid.model.robot import Validity
 from slipid.search_space import Space
 
-NOTICED = 1 / WEAK**2
-"""Information along a unit direction at which it is no longer flat; that of the prior is 1."""
+FLAT_INFORMATION = 1 / WEAK**2
+"""A unit direction is flat if the information along it is below this; that of the prior is 1."""
 TORQUE_SCALE = (
     "motor.back_emf",
     "motor.coulomb_friction",
@@ -32,11 +32,10 @@ TORQUE_SCALE = (
 )
 """Quantities that can be multiplied by a common factor without any change of the currents."""
 _NO_EFFECT = 1.02
-"""Information along a direction below which the data are uninformative about it.
+"""The data are uninformative about a direction if the information along it is below this.
 
-Such directions are searched first.
-"""
-_PART = 0.3
+Such directions are searched for first."""
+_NAMED_RATIO = 0.3
 """Smallest prior-scaled step, or power, of a number named in a formula, relative to the largest."""
 
 
@@ -49,7 +48,7 @@ class FlatDirection:
         powers: exponents p of the factors t^p for positive numbers, multiples of t [unit] for
             unbounded ones; the largest is 1 or -1.
         others: count of further numbers that change slightly.
-        formula: the direction in words.
+        formula: description of the direction in words.
         remedy: channels to log or runs to drive that would determine the numbers.
     """
 
@@ -177,15 +176,15 @@ def _sparse(
             and complete if it is flat, since the search would only find parts of it.
         move: prior-scaled step of each coordinate when its number is multiplied by a factor.
     """
-    alone = [k for k in among if precision.of([k])[0, 0] < NOTICED]
+    alone = [k for k in among if precision.of([k])[0, 0] < FLAT_INFORMATION]
     found = [([k], np.ones(1)) for k in alone]
     known = set(alone)
     whole = [k for k in symmetry if k not in known]
     along = move[whole] / np.linalg.norm(move[whole])
-    if len(whole) > 1 and precision.along(whole, along) < NOTICED:
+    if len(whole) > 1 and precision.along(whole, along) < FLAT_INFORMATION:
         found.append((whole, along))
         known.add(whole[0])
-    for limit in (_NO_EFFECT, NOTICED):
+    for limit in (_NO_EFFECT, FLAT_INFORMATION):
         while left := [k for k in among if k not in known]:
             value, u = precision.flattest(left)
             if value >= limit:
@@ -217,14 +216,15 @@ def _named(
 ) -> np.ndarray:
     """Return a mask of the numbers of a direction that its formula names.
 
-    These are the numbers with large prior-scaled steps (`_PART`). If the data have no information
-    along the direction, numbers with large powers are named as well: a number with a wide prior has
-    a small prior-scaled step even if its scale is as uncertain as that of the others.
+    These are the numbers with large prior-scaled steps (`_NAMED_RATIO`). If the data have no
+    information along the direction, numbers with large powers are named as well: a number with a
+    wide prior has a small prior-scaled step even if its scale is as uncertain as that of the
+    others.
     """
-    main = np.abs(u) >= _PART * np.abs(u).max()
+    main = np.abs(u) >= _NAMED_RATIO * np.abs(u).max()
     if precision.along(picked, u) < _NO_EFFECT and len({axis.is_log for axis in axes}) == 1:
         power = np.abs(u * std)
-        main |= power >= _PART * power.max()
+        main |= power >= _NAMED_RATIO * power.max()
     return np.asarray(main)
 
 
@@ -240,6 +240,8 @@ def _rounded(
     top = float(np.abs(step[main]).max())
     halves = np.where(main, np.round(2 * step / top) / 2 * top, step)
     size = float(np.linalg.norm(halves / std))
-    if (halves[main] != 0).all() and precision.along(picked, halves / std / size) < NOTICED:
+    if (halves[main] != 0).all() and precision.along(
+        picked, halves / std / size
+    ) < FLAT_INFORMATION:
         return halves / size
     return step

@@ -1,4 +1,4 @@
-"""Texts on flat directions: a formula in words, and the logs or runs that would determine it."""
+"""Texts about flat directions: formulas in words, and logs or runs that would determine them."""
 
 from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
@@ -9,9 +9,9 @@ from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.model.robot import Validity
 from slipid.parameter import Entry
 
-_LARGE = 10.0
-"""Ratio of powers from which a product formula is not used, as it would be hard to read."""
-_SAME = 0.05
+_LARGEST_POWER_RATIO = 10.0
+"""Product formulas with a larger ratio of powers are not used, as they would be hard to read."""
+_POWER_TOLERANCE = 0.05
 """Difference below which two powers count as equal."""
 
 NOTHING = "the data hardly determine "
@@ -61,7 +61,9 @@ def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
     names = [axis.label for axis in axes]
     if len(axes) == 1:
         return NOTHING + names[0]
-    if all(axis.is_log for axis in axes) and np.ptp(np.log(np.abs(power))) < np.log(_LARGE):
+    if all(axis.is_log for axis in axes) and np.ptp(np.log(np.abs(power))) < np.log(
+        _LARGEST_POWER_RATIO
+    ):
         return _product(axes, power)
     if not any(axis.is_log for axis in axes) and len({axis.unit for axis in axes}) == 1:
         return _sum(names, power)
@@ -74,7 +76,7 @@ def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
 
 def _product(axes: list[Axis], power: np.ndarray) -> str:
     names = [axis.label for axis in axes]
-    if (np.abs(power - 1) < _SAME).all():
+    if (np.abs(power - 1) < _POWER_TOLERANCE).all():
         short = [axis.label for axis in axes if axis.entry.quantity != "surface.friction"]
         if len(axes) - len(short) > 1:  # one pattern for the frictions of several floors
             short.append("surface.*.friction")
@@ -91,7 +93,7 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
         f"{name} {'times' if k > 0 else 'divided by'} {_power('t', abs(k))}"
         for name, k in zip(names, power, strict=True)
     ]
-    return f"no effect on the data for any factor t: {', '.join(parts)}"
+    return f"changes without effect on the data, for any factor t: {', '.join(parts)}"
 
 
 def _pair(names: list[str], power: np.ndarray) -> tuple[str, str, float]:
@@ -104,19 +106,19 @@ def _pair(names: list[str], power: np.ndarray) -> tuple[str, str, float]:
 
 
 def _power(name: str, k: float) -> str:
-    return name if abs(k - 1) < _SAME else f"{name}^{k:.2g}"
+    return name if abs(k - 1) < _POWER_TOLERANCE else f"{name}^{k:.2g}"
 
 
 def _sum(names: list[str], weight: np.ndarray) -> str:
-    if (np.abs(weight - 1) < _SAME).all():
+    if (np.abs(weight - 1) < _POWER_TOLERANCE).all():
         return f"{', '.join(names)} only as their differences"
     if len(names) == 2:
         first, other, k = _pair(names, weight)  # other - k first does not change
-        times = "" if abs(abs(k) - 1) < _SAME else f"{abs(k):.2g} "
+        times = "" if abs(abs(k) - 1) < _POWER_TOLERANCE else f"{abs(k):.2g} "
         sign = "+" if k < 0 else "-"
         return f"{names[0]} and {names[1]} only as {other} {sign} {times}{first}"
     parts = [f"{n} {k:+.2g} t" for n, k in zip(names, weight, strict=True)]
-    return f"no effect on the data for any t: {', '.join(parts)}"
+    return f"changes without effect on the data, for any t: {', '.join(parts)}"
 
 
 VOLTAGE = "log the motor voltage (or duty and bus voltage)"
@@ -126,11 +128,11 @@ _FLOOR = "surface"
 _CAMERA = (
     (
         ("camera.scale", "robot.wheel_radius"),
-        "measure the wheel radius, or a length in the camera's picture: motion cannot help",
+        "measure the wheel radius, or a length in the camera's picture: more runs cannot help",
     ),
     (
         ("camera.marker_yaw", "robot.drive_offset"),
-        "measure the marker's angle on the body: no motion distinguishes the two",
+        "measure the marker's angle on the body: no motion can distinguish the two",
     ),
     (("camera.scale", _FLOOR), "add a floor on which the wheels do not slip"),
     (("robot.wheel_radius", _FLOOR), "add a floor on which the wheels do not slip"),
@@ -138,7 +140,7 @@ _CAMERA = (
     (("camera.marker_place",), "turn on the spot in view of the camera"),
     (("camera.lag",), "start, stop and change speed in view of the camera"),
     *(
-        ((f"camera.{name}",), "drive across the whole picture, its corners included")
+        ((f"camera.{name}",), "drive across the whole picture, including its corners")
         for name in ("tilt", "radial", "tangential")
     ),
     (("camera.scale",), "measure a length in the camera's picture"),
@@ -149,7 +151,7 @@ _CAMERA = (
 `_FLOOR` stands for any quantity of a floor.
 """
 FEW_HEADINGS = 4
-"""Number of headings below which the remedy asks for more; opposite ones count as two."""
+"""With fewer headings, the remedy proposes more; opposite headings count as two."""
 TURNING = 0.05
 """Yaw rate by the encoders above which a run counts as a curve [rad/s]."""
 LITTLE_SLIP = 0.03
@@ -165,7 +167,7 @@ def remedy(
     validity: Mapping[str, Validity],
     sideways: bool = True,
 ) -> str:
-    """Return a sentence on what to log or to drive to determine numbers of a flat direction.
+    """Return a sentence about logs or runs that would determine the numbers of a flat direction.
 
     Args:
         found: numbers of the direction.

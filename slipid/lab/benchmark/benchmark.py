@@ -16,7 +16,7 @@ from slipid.lab.benchmark.scores import FoldScore, RunScore
 from slipid.lab.benchmark.sets import SOURCES, is_available
 from slipid.lab.benchmark.slipid_rows import NAME
 from slipid.lab.benchmark.summary import RowSummary, reading, summary
-from slipid.lab.benchmark.work import OWN_MAP, QUICK_KIND, BenchmarkOptions, FoldTask, data_of
+from slipid.lab.benchmark.work import MAP_ROW, QUICK_KIND, BenchmarkOptions, FoldTask, data_of
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
@@ -55,7 +55,7 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
     for source in sources:
         try:
             each.append(tasks_of(options, source.name))
-        except Exception as error:  # a data set that cannot be read does not stop the others
+        except Exception as error:  # A data set that cannot be read does not stop the others.
             unread[source.name] = FoldScore.of_error(error).absent
             report.line(f"skipped: {source.name}: {unread[source.name]}")
     folds = alternating(each)
@@ -63,7 +63,8 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
         task for task in (HuskyFloorTask(options), RobotinoFloorTask(options)) if task.is_requested
     ]
     rectangle = RectangleTask(options)
-    # the Robotino's floor table comes last: it reuses slipid's fits to its folds by heading
+    # The floor table of the Robotino comes last, since it reuses slipid's fits to the folds by
+    # heading.
     tasks: list[BenchmarkTask] = [*folds, *floors]
     if not options.quick and set(CONTROLLERS) & set(options.only or CONTROLLERS):
         tasks.insert(0, rectangle)
@@ -117,7 +118,7 @@ def _check(options: BenchmarkOptions) -> None:
             f"{options.data}: no such folder; expected the folder of the data sets (--data)"
         )
     classifiers = [method.name for method in husky_classifiers()]
-    every = list(dict.fromkeys([NAME, OWN_MAP, *ROWS, *classifiers, *CONTROLLERS]))
+    every = list(dict.fromkeys([NAME, MAP_ROW, *ROWS, *classifiers, *CONTROLLERS]))
     for name in options.only:
         if name not in every:
             raise DataError(

@@ -1,4 +1,4 @@
-"""Protocols of the benchmark: which runs are held out, and what methods are given about floors."""
+"""Protocols of the benchmark: held-out runs, and what methods are told about floors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ HEADING_FOLDS = 2
 SPEED_FOLDS = 2
 """Largest number of folds by speeds; if there are more speeds, several share a fold."""
 INNER_FOLDS = 1
-"""Number of folds of the training runs that are held out in turn to pick settings."""
+"""Number of folds of the training runs that are held out in turn to select settings."""
 LEAST_TRAINING, LEAST_HELD_OUT = 8, 3
 """Smallest numbers of training runs and of held-out runs of a split."""
 ONLY_FOLD = -1
@@ -47,9 +47,9 @@ PROTOCOLS: dict[str, BenchmarkProtocol] = {
     "known_floor": BenchmarkProtocol("headings", True, "new headings on a known floor"),
     "unknown_floor": BenchmarkProtocol("headings", False, "new headings on an unknown floor"),
     "sectors": BenchmarkProtocol(
-        "sectors", True, "left-out sectors of 60 degrees on a known floor"
+        "sectors", True, "held-out sectors of 60 degrees on a known floor"
     ),
-    "speeds": BenchmarkProtocol("speeds", True, "a left-out speed on a known floor"),
+    "speeds": BenchmarkProtocol("speeds", True, "a held-out speed on a known floor"),
     "new_floor": BenchmarkProtocol("floors", False, "a floor without training runs", True),
     "two_floors": BenchmarkProtocol("all", False, "runs from one floor to another, floors unknown"),
 }
@@ -149,14 +149,14 @@ def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
 
 
 def inner(runs: Sequence[Run], kind: str) -> Labels:
-    """Return the inner fold of every training run, for the cross-validation that picks settings.
+    """Return the inner fold of every training run, for the cross-validation that selects settings.
 
     The training runs are divided by the protocol's kind of split. The `INNER_FOLDS` largest parts
-    are held out in turn and numbered from 0. All other runs are -1, or `INNER_FOLDS` where runs are
+    are held out in turn and numbered from 0. All other runs are -1, or `INNER_FOLDS` if runs are
     assigned at random, and always remain training runs. If the training runs have fewer than two
     parts of the kind, they are divided by headings. This is always so for sectors: every other
-    sector is missing from the training runs already, and without one more the gap would be three
-    times as wide as that of the protocol.
+    sector is already missing from the training runs, and without one more the gap would be three
+    times as wide as in the protocol.
     """
     facts = [facts_of_run(run) for run in runs]
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):

@@ -10,7 +10,7 @@ import numpy as np
 from slipid.deploy.deploy import ROBOT, robot_of_force_balance
 from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.slipid_rows import fit_slipid
-from slipid.lab.benchmark.work import OF_FITS, BenchmarkOptions, data_of, problem_of
+from slipid.lab.benchmark.work import FIT_SOURCES, BenchmarkOptions, data_of, problem_of
 from slipid.lab.trial import trial
 from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
@@ -57,7 +57,7 @@ class RectangleTask:
         self._failure.unlink(missing_ok=True)
         try:
             self._identify()
-        except Exception as error:  # a task that fails does not stop the others
+        except Exception as error:  # A task that fails does not stop the others.
             write_json(self._failure, {"failed": FoldScore.of_error(error).absent})
         return self.name
 
@@ -69,7 +69,7 @@ class RectangleTask:
     def _identify(self) -> None:
         """Fit slipid to all runs, and write robot.json."""
         data = data_of(self.options, SOURCE)
-        code = source_hash(*OF_FITS)
+        code = source_hash(*FIT_SOURCES)
         key = key_of(data.job.config.hash, data.job.data_hash, code)
         everybody = np.arange(len(data.logged))
         kept = Checkpoint(self.folder, key)
@@ -86,12 +86,12 @@ class RectangleTask:
             Content that `slipid trial` writes, or the reason for a failure under the key `failed`.
         """
         if self._failure.is_file():
-            return read_json(self._failure, "why there is no robot")
+            return read_json(self._failure, "the reason why there is no robot")
         plant = "testsite" if find_spec("mujoco") is not None else "twin"
         only = self.options.only or CONTROLLERS
         controllers = [name for name in CONTROLLERS if name in only]
         try:
             options = trial.TrialOptions(plant, controllers=tuple(controllers), starts=STARTS)
             return trial.trial(self.folder, options, executor, report).content
-        except Exception as error:  # a failed trial does not stop the rest of the benchmark
+        except Exception as error:  # A failed trial does not stop the rest of the benchmark.
             return {"failed": FoldScore.of_error(error).absent}

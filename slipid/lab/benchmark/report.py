@@ -26,7 +26,7 @@ COLUMNS: Mapping[str, tuple[str, float, int]] = {
 """Column heading, factor to the displayed unit and decimal places, by field of `RowSummary`."""
 WITH_INTERVALS = ("endpoint_error", "behind")
 """Fields that are shown with their 90 % intervals."""
-ON_THE_PAGE = ("length_error", "twist_error")
+PAGE_ONLY = ("length_error", "twist_error")
 """Fields that are shown only on the HTML page, as a terminal is too narrow for them."""
 
 
@@ -36,7 +36,7 @@ def show_benchmark(page: Page, found: Content) -> None:
         for protocol, rows in one["protocols"].items():
             about = found["protocols"][protocol]
             title = f"\n{name}: {about}; end points over the {one['over']}"
-            brief = [number for number in shown(rows) if number not in ON_THE_PAGE]
+            brief = [number for number in shown(rows) if number not in PAGE_ONLY]
             head, body = methods(rows, brief, COSTS[1:])
             made = table(head, title, right=head[1:])
             for row, *cells in body:
@@ -80,7 +80,7 @@ def methods(
 
 
 def shown(rows: Content) -> list[str]:
-    """Return the fields of `COLUMNS` that at least one row has a value for."""
+    """Return the fields of `COLUMNS` for which at least one row has a value."""
     return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
 
 
@@ -106,7 +106,7 @@ def absent(rows: Content) -> list[str]:
     why: dict[str, list[str]] = {}
     for name, row in rows.items():
         if row["unconverged"]:
-            why.setdefault(f"fits did not come to rest: {row['unconverged']}", []).append(name)
+            why.setdefault(f"fits that did not converge: {row['unconverged']}", []).append(name)
         if row["absent"]:
             why.setdefault(("failed: " if row["failed"] else "") + row["absent"], []).append(name)
     return [f"{', '.join(names)}: {reason}" for reason, names in why.items()]
@@ -165,13 +165,13 @@ def classifiers(found: Content) -> ExtraTable:
 
     Rows are sorted by their accuracy after the longest time, the best first.
     """
-    chance = f"always naming the commonest floor is right in {100 * found['chance']:.0f} %"
+    chance = f"always choosing the most frequent floor gives {100 * found['chance']:.0f} %"
     title = f"{found['about']}; {found['runs']} runs; {chance}"
     if lost := [f"{row['name']}: {row['absent']}" for row in found["rows"] if row["absent"]]:
         title = f"{title}; failed: {'; '.join(lost)}"
     rows = [row for row in found["rows"] if row["after"]]
     seconds = [after["seconds"] for after in rows[0]["after"]] if rows else []
-    head = ("right, %, after", *(f"{x:g} s" for x in seconds), "points over slipid", "numbers")
+    head = ("correct, %, after", *(f"{x:g} s" for x in seconds), "points above slipid", "numbers")
     body: list[tuple[str, ...]] = []
     for row in sorted(rows, key=lambda row: -row["after"][-1]["accuracy"][0]):
         right = [
@@ -184,7 +184,7 @@ def classifiers(found: Content) -> ExtraTable:
 
 
 def settings_lines(rows: Content) -> list[str]:
-    """Return a line for each row that has settings: those picked by cross-validation by fold."""
+    """Return a line for each row with settings: those selected by cross-validation in each fold."""
     return [
         f"{name}: {'; '.join(dict.fromkeys(row['settings']))}"
         for name, row in rows.items()
@@ -195,14 +195,13 @@ def settings_lines(rows: Content) -> list[str]:
 PAGE = "benchmark.html"
 LEGEND = (
     "End point: distance between the predicted and the true end, over the chord or the path. "
-    "Minus slipid's: the difference on the same runs, below zero where the row is better. "
-    "Length: of the chord or the path. Heading: at the end. "
-    "Twist: root mean square in windows of half a second. "
-    "In 90 %: share of ends in the row's own 90 % region. "
-    "Slip AUC: area under the receiver operating characteristic of slip detection. "
-    "Floor: share of the time in which the true floor is named, or rightly none. "
-    "Energy: error of the electric energy of a run. "
-    "Numbers: fitted parameters. Fit, step: time of one fit, and to predict one step of a run."
+    "Minus slipid's: the difference on the same runs, negative if the row is better. Length: of "
+    "the chord or the path. Heading: at the end. Twist: root mean square in windows of half a "
+    "second. In 90 %: share of end points in the predicted 90 % region. Slip AUC: area under the "
+    "receiver operating characteristic of slip detection. Floor: share of the time in which the "
+    "true floor is the most probable one, or correctly none. Energy: error of the electric "
+    "energy of a run. Numbers: fitted parameters. Fit, step: time of one fit, and to predict one "
+    "step of a run."
 )
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 92rem; margin: 2rem auto }
@@ -235,11 +234,11 @@ def page(found: Content, pictures: Mapping[str, bytes]) -> str:
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
         f"<title>Slip methods compared</title><style>{STYLE}</style>",
         "<h1>Slip methods compared</h1>",
-        "<p>Every row was fitted to the same runs and predicts others, from what the robot itself "
-        "measures; the pose is used once, at the start. Numbers in brackets are 90&nbsp;% "
-        "intervals by resampling runs; settings were picked on training runs alone.</p>",
+        "<p>All methods were fitted to the same runs and predict other runs from the sensors of "
+        "the robot; the pose is only used at the start. Brackets contain 90&nbsp;% intervals by "
+        "resampling of runs; settings were selected on training runs only.</p>",
         f"<p class='note'>{escape(LEGEND)}</p>",
-        "<h2>What the tables say</h2><ul>",
+        "<h2>Summary</h2><ul>",
         *(f"<li>{escape(sentence)}</li>" for sentence in found["reading"]),
         "</ul>",
     ]
@@ -268,7 +267,7 @@ def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[s
         parts.append(html_table(*methods(rows, shown(rows), COSTS)))
         parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
         if lines := settings_lines(rows):
-            parts.append("<details class='note'><summary>settings picked, fold by fold</summary>")
+            parts.append("<details class='note'><summary>selected settings, fold by fold</summary>")
             parts += [*(f"<div>{escape(line)}</div>" for line in lines), "</details>"]
     return parts
 

@@ -126,7 +126,7 @@ def _floor_right(run: Run, predicted: PredictedRun) -> float | None:
     names = list(predicted.floors)
     best = np.argmax(np.stack([predicted.floors[name] for name in names]), axis=0)
     known = {base_of(name) for name in names}
-    # the right answer for a floor without training runs is unknown
+    # The correct answer for a floor without training runs is "unknown".
     true = base_of(run.floor) if base_of(run.floor) in known else "unknown"
     right = np.array([base_of(names[k]) == true for k in best])
     return float((right * run.signals.dt).sum() / run.signals.dt.sum())
@@ -148,12 +148,12 @@ class FoldScore(Generic[Scored]):
 
     Attributes:
         runs: scores of the held-out runs, or answers of a classifier of floors.
-        absent: reason why there are no scores: a channel that these logs lack, or an error; empty
-            if there are scores.
+        absent: reason why there are no scores: a channel that is missing in these logs, or an
+            error; empty if there are scores.
         failed: True if that reason is an error.
-        settings: settings picked by cross-validation, in words.
+        settings: settings selected by cross-validation, in words.
         numbers: number of fitted parameters.
-        tune_s: time to pick the settings [s].
+        tune_s: time to select the settings [s].
         fit_s: time of one fit [s].
         step_us: time to predict one step of one run [microseconds].
         converged: True if the fit converged.

@@ -67,7 +67,7 @@ SOURCES = (
     ),
     LogSource(
         name="robotino2021",
-        about="Robotino over the whole field of 2021, with a gyro, floors not named",
+        about="Robotino over the whole field of 2021, with a gyro, without names of floors",
         folder="robotino2021",
         config="robotino2021_field.toml",
         kinds=("headings",),
@@ -105,7 +105,7 @@ SOURCES = (
 
 @dataclass(frozen=True, eq=False)
 class DataSet:
-    """The runs of a source, with what slipid's fit and the splits need.
+    """The runs of a source, with all data for slipid's fit and for the splits.
 
     Attributes:
         source: source of the logs.

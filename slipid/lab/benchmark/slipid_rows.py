@@ -36,14 +36,13 @@ NAME = "slipid"
 TOLERANCE = 0.1
 """A fit has converged when no parameter changes by more than this multiple of its std.
 
-Errors of predictions scatter far more from run to run.
-"""
+The errors of predictions vary far more than this between runs."""
 STEPS_MULTIPLE = 16
 """The steps of a replay are padded to a multiple of this number, so that few shapes are compiled.
 """
 RUNS_PER_CALL = 32
 """Number of runs in one call of an estimator; fewer are padded, so that one shape is compiled."""
-LONGEST_S = 0.25
+LONGEST_STEP_S = 0.25
 """Longest step of an estimator [s]; longer steps are split, since it rejects those of 0.5 s."""
 
 
@@ -174,7 +173,7 @@ def estimator_runs(
     Args:
         fit: slipid's fit.
         batches: the runs.
-        data: logs that the numbers of the batches index.
+        data: logs to which the indices of the batches refer.
         floors: information about the floors.
     """
     runs = [run for batch in batches for run in batch.runs]
@@ -250,14 +249,14 @@ def replay(
     """Return the estimator's predictions of runs from their signals.
 
     The estimator's first row has zero duration and gives the wheels' first angles. Steps longer
-    than `LONGEST_S` are split into equal parts.
+    than `LONGEST_STEP_S` are split into equal parts.
 
     Args:
         estimator: the estimator.
         runs: signals of the runs.
         start: start pose of each run, shape (run, 3) [m, m, rad].
     """
-    parts = [np.ceil(run.dt / LONGEST_S - 1e-9).astype(int).clip(1) for run in runs]
+    parts = [np.ceil(run.dt / LONGEST_STEP_S - 1e-9).astype(int).clip(1) for run in runs]
     longest = max(int(part.sum()) for part in parts)
     longest = -(-longest // STEPS_MULTIPLE) * STEPS_MULTIPLE + 1
     shape, labels = (RUNS_PER_CALL, longest), estimator.robot.labels

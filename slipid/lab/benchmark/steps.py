@@ -57,7 +57,7 @@ def in_order(batches: Sequence[RunBatch]) -> list[Run]:
 
 
 def _step_count(poses: float, poses_per_step: int) -> int:
-    """Return the number of steps of a run with so many logged poses, a power of two."""
+    """Return the number of steps of a run with this number of logged poses, a power of two."""
     return 2 ** max(1, int(np.floor(np.log2(max(0.8 * poses / poses_per_step, 2.0)))))
 
 

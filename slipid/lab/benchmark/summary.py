@@ -92,7 +92,7 @@ class Bootstrap:
 
     @classmethod
     def of(cls, runs: Sequence[RunScore]) -> "Bootstrap":
-        """Return draws of scored runs; a run with a negative cluster is a cluster of its own."""
+        """Return draws of scored runs; a run with a negative cluster is a separate cluster."""
         sector = np.array([run.cluster for run in runs])
         alone = -1 - np.arange(len(runs))
         return cls.by([run.floor for run in runs], np.where(sector < 0, alone, sector))
@@ -107,7 +107,9 @@ class Bootstrap:
         for k in range(len(names)):
             mine = np.flatnonzero(floor == k)
             kinds, of = np.unique(cluster[mine], return_inverse=True)
-            if len(kinds) < FEWEST_CLUSTERS:  # too few clusters to estimate their scatter
+            if (
+                len(kinds) < FEWEST_CLUSTERS
+            ):  # There are too few clusters to estimate their scatter.
                 kinds, of = mine, np.arange(len(mine))
             picked = rng.multinomial(len(kinds), np.full(len(kinds), 1 / len(kinds)), DRAWS)
             draws[1:, mine] = picked[:, of]
@@ -232,22 +234,22 @@ def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
         if s["endpoint_error"] is not None and not row.startswith(NAME)
     }
     if not errors:
-        return f"{head}slipid errs by {mine}; nothing to compare it with"
+        return f"{head}error of slipid {mine}; no other row to compare with"
     order = sorted(errors, key=lambda row: errors[row].value)
     behind = {row: b for row in order if (b := found[row]["behind"]) is not None}
     ahead = [row for row, b in behind.items() if b.high < 0]
     if ahead:
         also = f" (and {len(ahead) - 1} more)" if len(ahead) > 1 else ""
         return (
-            f"{head}{ahead[0]}{also} is ahead of slipid: {_percent(errors[ahead[0]])} against "
+            f"{head}{ahead[0]}{also} is better than slipid: {_percent(errors[ahead[0]])} against "
             f"{mine}, {_points(behind[ahead[0]])}"
         )
     best = order[0]
-    text = f"{head}slipid errs by {mine}, the best other row, {best}, by {_percent(errors[best])}"
+    text = f"{head}error of slipid {mine}, of the best other row, {best}, {_percent(errors[best])}"
     tied = [row for row, b in behind.items() if b.low <= 0 <= b.high]
     if tied:
         more = f" and {len(tied) - MOST_NAMED_ROWS} more" if len(tied) > MOST_NAMED_ROWS else ""
-        return f"{text}; not told apart from {', '.join(tied[:MOST_NAMED_ROWS])}{more}"
+        return f"{text}; no significant difference to {', '.join(tied[:MOST_NAMED_ROWS])}{more}"
     return f"{text}, {_points(behind[best])}" if best in behind else text
 
 

@@ -24,17 +24,18 @@ from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
-OWN_MAP = "slipid_map"
+MAP_ROW = "slipid_map"
 """Name of the row of slipid's estimator that is given the map of the floors."""
 
 
-OF_FITS = (
+FIT_SOURCES = (
     *("parameter", "search_space", "model", "data", "fitting", "predict", "infer", "app"),
     "lab/benchmark/slipid_rows",
 )
-"""Packages and modules that slipid's fits depend on; saved fits are void when one changes."""
-OF_ROWS = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
-"""Packages that the scores of all rows depend on in addition to `OF_FITS`."""
+"""Packages and modules on which slipid's fits depend; saved fits are invalid if one of them
+changes."""
+ROW_SOURCES = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
+"""Packages that the scores of all rows depend on in addition to `FIT_SOURCES`."""
 QUICK_RUNS = 60
 """Largest number of runs of each data set in a quick benchmark."""
 QUICK_KIND = "headings"
@@ -79,7 +80,7 @@ class FoldTask:
         return f"{self.source}/{self.kind}_{self.fold}"
 
     def run(self) -> str:
-        """Fit and score all rows that the checkpoint lacks, and return the task's name."""
+        """Fit and score all rows that are missing in the checkpoint, and return the task's name."""
         setup_jax(quiet=True)
         kept = checkpoint_of(self, fit=False)
         found = {key: kept.load_json("_".join(key)) for key in keys_of(self)}
@@ -129,9 +130,9 @@ def split_of(task: FoldTask) -> Split:
 def checkpoint_of(task: FoldTask, fit: bool) -> Checkpoint:
     """Return the checkpoint of slipid's fit in a task if `fit`, else that of the task's scores."""
     data = data_of(task.options, task.source)
-    more = () if fit else (data.crossing_hash, source_hash(*OF_ROWS))
+    more = () if fit else (data.crossing_hash, source_hash(*ROW_SOURCES))
     split = split_of(task)
-    marks = data.job.config.hash, data.job.data_hash, source_hash(*OF_FITS)
+    marks = data.job.config.hash, data.job.data_hash, source_hash(*FIT_SOURCES)
     key = key_of(*marks, split.training, split.held_out, *more)
     # the folder name contains the key, so that results of other options are not overwritten
     return Checkpoint(task.options.out / "kept" / task.name / key[:12], key)
@@ -143,7 +144,7 @@ def keys_of(task: FoldTask) -> list[tuple[str, str]]:
     Protocols with unknown floors need more than one floor.
     """
     options, data = task.options, data_of(task.options, task.source)
-    own = [slipid_rows.NAME] + ([OWN_MAP] if task.kind == "all" else [])
+    own = [slipid_rows.NAME] + ([MAP_ROW] if task.kind == "all" else [])
     every = own + [method.name for method in rows(data.spec)]
     names = [name for name in every if not options.only or name in options.only]
     several = len({base_of(f.floor) for f in data.facts}) > 1 and not options.quick
@@ -153,7 +154,7 @@ def keys_of(task: FoldTask) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, eq=False)
 class FoldData:
-    """Runs and slipid's fit that all rows of one fold share.
+    """Runs and slipid's fit for all rows of one fold.
 
     Attributes:
         data: the data set.
@@ -188,7 +189,7 @@ def fold_data(task: FoldTask) -> FoldData:
         problem = problem_of(task.options, task.source)
         fit = slipid_rows.fit_slipid(data.job, problem, split.training, kept)
         robot = fit.contact.robot
-    except Exception as error:  # without slipid's fit, the other rows can still be scored
+    except Exception as error:  # Without slipid's fit, the other rows can still be scored.
         fit = FoldScore.of_error(error)
         robot = Space(data.job.robot, data.job.choices).template
 
@@ -206,7 +207,7 @@ def fold_data(task: FoldTask) -> FoldData:
 
 
 def _with_facts(batch: RunBatch, data: DataSet, numbers: np.ndarray) -> RunBatch:
-    """Return the batch with floors, headings and speeds of its runs as the splits use them.
+    """Return the batch with floors, headings and speeds of its runs as used by the splits.
 
     Floors include the load set-up; heading and speed follow from the commanded motion.
     """
@@ -223,7 +224,7 @@ def _score(data: FoldData, protocol: str, name: str) -> FoldScore[RunScore]:
     rules = PROTOCOLS[protocol]
     runs = [run.with_floor(rules.floor_known) for run in data.runs]
     try:
-        if name in (slipid_rows.NAME, OWN_MAP):
+        if name in (slipid_rows.NAME, MAP_ROW):
             return _slipid(data, rules, runs, name)
         method = next(m for m in rows(data.data.spec) if m.name == name)
         has = common(runs) | ({"twist"} if data.data.spec.determines_twist else set())
@@ -266,9 +267,9 @@ def _slipid(
     fit, known = data.fit, protocol.floor_known
     if isinstance(fit, FoldScore):
         return fit
-    if name == OWN_MAP and data.data.map is None:
+    if name == MAP_ROW and data.data.map is None:
         return FoldScore.lacking(["map"])
-    floor_map = data.data.map if name == OWN_MAP else None
+    floor_map = data.data.map if name == MAP_ROW else None
     floors = slipid_rows.FloorKnowledge(known, protocol.unseen_floors, floor_map)
     has_gyro = all(run.signals.gyro is not None for run in runs)
 

@@ -1,4 +1,4 @@
-"""The 2021 paper's system: the slip of each wheel from the torque or current of its own motor.
+"""The 2021 paper's system: the slip of each wheel from the torque or current of its motor.
 
     xi = back r (w_i (1 - s_i))
 
@@ -103,7 +103,7 @@ class PaperCode(_AsPublished):
 def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
     """Return samples of single wheels and windows within the authors' limits of slip and current.
 
-    If there are more than `MOST_SAMPLES`, so many are drawn at random.
+    If there are more than `MOST_SAMPLES`, this number is drawn at random.
     """
     signals = w.signals
     rim = signals.speed * spec.wheel_radius

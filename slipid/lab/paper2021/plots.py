@@ -1,4 +1,4 @@
-"""Reproduction of the 2021 paper: its numbers as JSON, its figures 2, 3, 4 and 7 from the data."""
+"""Reproduction of the 2021 paper: its numbers as JSON, and its figures 2, 3, 4 and 7."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def run(data_dir: Path, out: Path) -> list[Path]:
 
 
 def runs_2022(folder: Path) -> tuple[Log, ...] | None:
-    """Return the 2022 runs, each on one surface; None if the folder has none."""
+    """Return the 2022 runs, each on one surface; None if the folder contains none."""
     pattern = "one_surface/*/*.csv"
     return read_runs(folder, pattern, "robotino2022").logs if any(folder.glob(pattern)) else None
 
@@ -112,7 +112,7 @@ def figure4(table: MotorTable) -> Figure:
 def figure7(tracks: tuple[SquareTrack, ...]) -> Figure:
     """Return figure 7: camera tracks on the commanded rectangle, headings and closure errors."""
     made = drawing.figure(
-        12.0, 5.7, "Figure 7: the same commanded rectangle, three ways to follow it"
+        12.0, 5.7, "Figure 7: the same commanded rectangle, followed with three controllers"
     )
     panels = list(made.subplots(1, len(tracks), squeeze=False)[0])
     for axes, track in zip(panels, tracks, strict=True):

@@ -20,11 +20,11 @@ class TrackFile:
 
     Attributes:
         name: key in results.
-        label: controller that the robot ran.
+        label: controller of the robot.
         square: <square> in the file name `square_<square>_camera.csv` in the folder figure7.
-        authors_frames: camera frames of the first side, by the authors' own index.
+        authors_frames: camera frames of the first side, by the index of the authors.
         side_frames: camera frames of the first side in this file, up to the robot's turn.
-        printed_path_length: length of the first side as the paper prints it [mm].
+        printed_path_length: length of the first side printed in the paper [mm].
     """
 
     name: str
@@ -51,7 +51,7 @@ COMMANDED_SIDES = (900.0, 400.0)
 
 @dataclass(frozen=True, eq=False)
 class SquareTrack:
-    """One camera track of figure 7, with the numbers that the figure shows.
+    """One camera track of figure 7, with the numbers shown in the figure.
 
     Attributes:
         file: file of the track.
@@ -125,7 +125,7 @@ SCHEMA = "slipid.paper2021/1"
 
 @dataclass(frozen=True, eq=False)
 class PaperResult:
-    """Numbers of the paper, computed from its data.
+    """Results of the paper, computed from its data.
 
     Attributes:
         field: samples and models of figure 2: motor 1 over the whole site.
@@ -140,7 +140,7 @@ class PaperResult:
     transfer: Content | None
 
     def as_dict(self) -> dict[str, object]:
-        """Return all numbers keyed by name, ready for JSON."""
+        """Return all results, keyed by name, in the form of paper.json."""
         return {
             "schema": SCHEMA,
             "figure2": _table_dict(1, self.field),
@@ -160,7 +160,7 @@ def find_folder(data: Path) -> Path:
     """Return the folder of the 2021 data set: `data` itself or the folder robotino2021 in it.
 
     Raises:
-        DataError: neither contains the data set.
+        DataError: neither of them contains the data set.
     """
     for folder in (data / "robotino2021", data):
         if (folder / "experimental_data_gray.csv").is_file():
@@ -172,7 +172,7 @@ def find_folder(data: Path) -> Path:
 
 
 def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
-    """Compute the paper's numbers from its own data.
+    """Compute the paper's results from its own data.
 
     Args:
         folder: folder of the 2021 data set.

@@ -29,7 +29,7 @@ _TO_SI = np.array([1e-3, 1e-3, np.pi / 180.0])
 
 @dataclass(frozen=True)
 class Recipe:
-    """Parameters by which the authors turn logged columns into the points of a figure.
+    """Parameters with which the authors compute the points of a figure from logged columns.
 
     w_eff = n J v / r; s = 1 - w_eff / w; U = C_e w + R I sign(w); M = U I / w. Here w is the
     measured speed of the motor shaft, w_eff its speed without slip [rad/s], v the measured twist of
@@ -159,8 +159,8 @@ def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[st
     """Return the columns of a file, keyed by name, in the file's own units.
 
     Raises:
-        DataError: the file cannot be read, holds a cell that is no finite number, or lacks a column
-            that is needed.
+        DataError: the file cannot be read, contains a cell that is not a finite number, or lacks a
+            required column.
     """
     table = read_table(path, preset(layout), all_columns=True)
     rows, columns = np.nonzero(~np.isfinite(table.values))
@@ -189,10 +189,12 @@ def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
         ValueError: the log has no pose or no current.
     """
     if log.pose is None or log.current is None:
-        raise ValueError(f"{log.name}: slip against current needs both pose and current")
+        raise ValueError(
+            f"{log.name}: no pose or no current; expected both, to compute slip over current"
+        )
     first = first_moved(log.wheel_angle, recipe.wheel_radius)
     start = log.time[-1] if first is None else log.time[first]
-    # where rows are sparse, two windows may start at the same row; only one of them is kept
+    # If rows are sparse, two windows may start at the same row; only one of them is kept.
     starts = np.arange(start, log.time[-1], recipe.row_period)
     edges = np.unique(np.searchsorted(log.time, starts))
     if len(edges) < 2:
@@ -215,7 +217,7 @@ def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
 
 
 def leave_one_surface_out(logs: Iterable[Log]) -> Content:
-    """Return how well curves fitted to other surfaces, or to a surface itself, predict its slip.
+    """Return the errors of curves fitted to other surfaces, or to a surface itself, on its slip.
 
     Poses are used as the camera logged them, without correction of its scale and lag.
 
@@ -226,7 +228,7 @@ def leave_one_surface_out(logs: Iterable[Log]) -> Content:
         the `mean` of each of these errors over surfaces, with equal weights.
 
     Raises:
-        ValueError: if fewer than two surfaces are there, or one has too few samples for a curve.
+        ValueError: there are fewer than two surfaces, or one has too few samples for a curve.
     """
     parts: dict[str, list[np.ndarray]] = {}
     for log in logs:
@@ -235,7 +237,7 @@ def leave_one_surface_out(logs: Iterable[Log]) -> Content:
         parts.setdefault(log.surface, []).append(curve_points(log, FIGURES_3_AND_4))
     points = {surface: np.concatenate(part) for surface, part in parts.items()}
     if len(points) < 2:
-        raise ValueError(f"surfaces {list(points)}: leaving one out needs at least two")
+        raise ValueError(f"surfaces {list(points)}; expected at least two, to hold one of them out")
     counts = {surface: len(point) for surface, point in points.items()}
     for surface, count in counts.items():
         if count < 2:

@@ -47,7 +47,7 @@ _FORMS = {
 
 
 def deployed_slip(current: np.ndarray) -> np.ndarray:
-    """Return the slip [-] of each wheel from its own smoothed current [A], both (sample, wheel).
+    """Return the slip [-] of each wheel from its smoothed current [A], both (sample, wheel).
 
     1 - s_i = a_i I~_i + b_i where the smoothed current I~_i > threshold, else s_i = 0. The paper's
     robot smoothed the current from sample to sample, I~_k = memory I~_(k-1) + (1 - memory) I_k. The
@@ -108,7 +108,9 @@ def fit_form(samples: SlipSamples, name: str) -> FittedForm:
     regressor, powers = _FORMS[name]
     x = getattr(samples, regressor)
     if len(x) < len(powers):
-        raise ValueError(f"{name}: {len(x)} samples cannot fix {len(powers)} coefficients")
+        raise ValueError(
+            f"{name}: {len(x)} samples; expected at least {len(powers)}, one per coefficient"
+        )
     design = x[:, None] ** np.array(powers)
     coefficients = np.linalg.lstsq(design, samples.slip, rcond=None)[0]
     return FittedForm(

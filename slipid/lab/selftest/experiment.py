@@ -1,4 +1,4 @@
-"""The command `slipid selftest`: which parameters an experiment can recover."""
+"""The command `slipid selftest`: the parameters that an experiment can recover."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -31,10 +31,9 @@ SCHEMA = "slipid.selftest/1"
 LEVEL = 1e-3
 """Significance level of the two tests of a parameter's errors over all replicates.
 
-The tests ask whether its 90 % intervals contain the truth often enough, and whether its errors are
-as small as its standard deviations say. A parameter that fails one of them was recovered wrongly,
-unless it counts as not recovered anyway.
-"""
+The tests check whether its 90 % intervals contain the truth often enough, and whether its errors
+agree with its standard deviations. A parameter that fails one of them was recovered wrongly, unless
+it counts as not recovered anyway."""
 LEAST_CONVERGED = 0.75
 """Smallest fraction of the replicates' fits that must converge for a successful self test."""
 VERDICT_ORDER = ("identified", "weak", "not_identified", "at_bound")
@@ -109,7 +108,10 @@ def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
     )
     if not has_current:
         logs = [replace(log, current=None) for log in logs]
-    report.line(f"no logs given: {len(logs)} runs of [selftest] on {', '.join(wanted.surfaces)}")
+    report.line(
+        f"no logs given; simulating the {len(logs)} runs of [selftest] on "
+        f"{', '.join(wanted.surfaces)}"
+    )
     return fit_task(config, collect(logs), [], report)
 
 

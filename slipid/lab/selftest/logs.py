@@ -1,9 +1,9 @@
 """Simulation of logs of a robot whose parameters are all known, for self tests and tests.
 
 The runs are a grid of straight and turning runs, such as those of a Robotino under an overhead
-camera. The noise is the one that the likelihood assumes: of the camera, of the motion (growing with
-distance), of each run, and of each run's current level. In addition, the logs have features of real
-logs that the likelihood does not model: encoder ticks, quantised unsigned currents with ripple,
+camera. The noise is that of the likelihood: of the camera, of the motion (growing with distance),
+of each run, and of the current level of each run. In addition, the logs have features of real logs
+that the likelihood does not model: encoder ticks, quantised unsigned currents with ripple,
 quantised voltages, repeated camera frames, uneven rows, and a delayed and ramped start.
 """
 
@@ -66,8 +66,8 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
 }
 """True parameters of the default robot in SI units, by path.
 
-They are of the magnitude found on real logs. All other parameters have their declared start values.
-"""
+They have the magnitudes found on real logs. All other parameters have their declared start
+values."""
 
 
 def nominal_robot(drives: Sequence[PlannedRun]) -> Robot:
@@ -83,7 +83,7 @@ def nominal_robot(drives: Sequence[PlannedRun]) -> Robot:
 def true_robot(
     drives: Sequence[PlannedRun], values: Mapping[str, float | Sequence[float]] | None = None
 ) -> Robot:
-    """Return a Robotino with the parameters `TRUTH`, of which `values` replaces some."""
+    """Return a Robotino with the parameters `TRUTH`, some of them replaced by `values`."""
     robot = nominal_robot(drives)
     known = {e.path for e in entries(robot)}
     values = {**TRUTH, **(values or {})}
@@ -145,7 +145,7 @@ class SimulatedSensors:
         row_period, frame_period: time between rows and between camera frames [s].
         delay, ramp: time from command to motion, and from there to full speed [s].
         wobble: amplitude of an oscillation of the wheel angle, divided by the wheel speed [s]; it
-            imitates speed control, which is never quite steady.
+            imitates the speed control, which is never perfectly steady.
         has_voltage: True if voltages are logged.
         signed: True if currents are logged with sign, False for magnitudes.
     """
@@ -333,7 +333,7 @@ class _LogSimulator:
         noise = s.voltage_noise * rng.normal(size=true.shape)
         held = np.asarray(motor.voltage(jnp.asarray(true), jnp.asarray(w))) + noise
         voltage = np.round(held / s.voltage_step) * s.voltage_step if s.has_voltage else None
-        # a Robotino reports wheel speeds in these steps, and 1.3 % too high
+        # A Robotino reports wheel speeds in these steps, and 1.3 % too high.
         quantum = 2.83 / self.robot.geometry.gear_ratio
         return current * s.current_step, voltage, np.round(1.013 * w / quantum) * quantum
 

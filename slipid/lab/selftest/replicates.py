@@ -49,8 +49,8 @@ def simulate_windows(
     """Return the windows with simulated poses, currents and voltages, noise included.
 
     Every segment starts at its first pose in `w`. The random effects of the current components are
-    part of the current that flows, which determines the voltage. The noise of variance
-    `w.current_var` is that of the ammeter: it is added to measured currents only.
+    part of the true current, which determines the voltage. The noise of variance `w.current_var` is
+    that of the ammeter and is added to measured currents only.
 
     Args:
         truth: robot with the true parameters, and the floors, loads, sessions of the windows.
@@ -138,11 +138,11 @@ def _shared(
 
 FILE = "replicates"
 """Name of the checkpoint's file of finished replicates, from which a later call continues."""
-SCATTER, MOST_PRIOR_STD = 0.5, 0.5
-"""True parameters are drawn with a std of `SCATTER` times the prior std, at most `MOST_PRIOR_STD`.
+TRUTH_STD_RATIO, MOST_PRIOR_STD = 0.5, 0.5
+"""True parameters are drawn with a std of `TRUTH_STD_RATIO` times the prior std, at most
+`MOST_PRIOR_STD`.
 
-Both stds are in the search space.
-"""
+Both stds are in the search space."""
 
 
 @dataclass(frozen=True)
@@ -203,8 +203,8 @@ _FILE = TypeAdapter(list[Replicate])
 def plausible(task: ConfigFitTask, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and std, in the search space, from which true parameters are drawn.
 
-    The mean is that of the prior; for the std see `SCATTER`. A parameter in `[selftest.truth]` has
-    exactly the value given there.
+    The mean is that of the prior; for the std see `TRUTH_STD_RATIO`. A parameter in
+    `[selftest.truth]` has exactly the value given there.
 
     Raises:
         DataError: `[selftest.truth]` names a parameter that does not exist or is fixed, or gives
@@ -212,7 +212,7 @@ def plausible(task: ConfigFitTask, problem: Problem) -> tuple[np.ndarray, np.nda
     """
     space, config = problem.space, task.config
     center = space.prior_mean.copy()
-    scatter = SCATTER * np.minimum(space.prior_std, MOST_PRIOR_STD)
+    scatter = TRUTH_STD_RATIO * np.minimum(space.prior_std, MOST_PRIOR_STD)
     for pattern, value in config.content.selftest.truth.items():
         where = f"{config.path}: selftest.truth.'{pattern}'"
         mine = [e for e in space.free if fnmatchcase(e.path, pattern)]
@@ -248,7 +248,7 @@ def replicates(
     fit = task.config.content.fit
     found = _FILE.validate_python(kept.load_json(FILE) or [])[:count]
     if found:
-        report.line(f"{len(found)} of {count} replicates are in {kept.folder / FILE}.json already")
+        report.line(f"{len(found)} of {count} replicates are already in {kept.folder / FILE}.json")
     report.stage("replicates")
 
     def tell(state: FitState) -> None:
@@ -328,7 +328,7 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
     """Return the mean end-point errors relative to the true chord, by floor and slip model.
 
     The runs are those of the experiment, simulated without noise, so that only errors of the fitted
-    parameters count.
+    parameters contribute.
     """
     start = jnp.zeros((len(w), 3))
 
@@ -343,7 +343,7 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
         "encoder": ends(as_increments(twist, w, truth)),
     }
     chord, floor = np.linalg.norm(true, axis=1), np.asarray(w.surface)
-    travels = chord > 0.1 * np.median(chord)  # turns on the spot have no chord
+    travels = chord > 0.1 * np.median(chord)  # Turns on the spot have no chord.
     error = {m: np.linalg.norm(end - true, axis=1) / chord for m, end in predicted_ends.items()}
     return {
         name: {model: float(np.mean(of_model[mine])) for model, of_model in error.items()}

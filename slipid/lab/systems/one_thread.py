@@ -1,4 +1,4 @@
-"""A single thread for scikit-learn, whose threads spend most time waiting for each other here."""
+"""A single thread for scikit-learn, whose threads would mostly wait for each other here."""
 
 from contextlib import AbstractContextManager
 

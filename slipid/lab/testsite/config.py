@@ -62,7 +62,7 @@ format = "tracked"
 
 @dataclass(frozen=True, eq=False)
 class SimulationPlan:
-    """Everything that a simulation drives and films.
+    """All runs and videos of a simulation.
 
     Attributes:
         hash: hash of the config and of the map files it names.
@@ -121,7 +121,7 @@ def plan(path: Path, text: str) -> SimulationPlan:
         if not any(fnmatch(name, pattern) for name, _ in named):
             folders = ", ".join(dict.fromkeys(f"{name[:-3]}*" for name, _ in named))
             raise DataError(
-                f"{path}: video: no run is named '{pattern}'; expected some of {folders}"
+                f"{path}: video: no run is named '{pattern}'; expected names of runs in {folders}"
             )
     filmed = tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video))
     return SimulationPlan(_hash(content, site, maps), content, site, maps, named, filmed)
@@ -145,20 +145,25 @@ def _check(
             _refuse_unknown(path, f"runs[{k}].surface", runs.surface, site.surfaces)
     for name, floor in maps.items():
         if name in site.surfaces:
-            raise DataError(f"{path}: maps.{name}: also the name of a surface; expected another")
+            raise DataError(
+                f"{path}: maps.{name}: also the name of a surface; expected another name"
+            )
         for surface in floor.surfaces:
             _refuse_unknown(path, f"maps.{name}", surface, site.surfaces)
         colours = [site.surfaces[s].colour.lower() for s in floor.surfaces]
         if len(set(colours)) < len(colours):
-            raise DataError(f"{path}: maps.{name}: two surfaces have one colour; expected others")
+            raise DataError(
+                f"{path}: maps.{name}: two surfaces have the same colour; expected different "
+                "colours"
+            )
     if "robotino2022" in content.formats:
         robot, sensors = site.robot, site.sensors
         fits = len(robot.wheel_azimuths_deg) == 3 and robot.gear_ratio == 16
         fits &= site.motor.ticks_per_revolution == 2000 and not sensors.current_is_signed
         if not fits:
             raise DataError(
-                f"{path}: formats: robotino2022 is for three wheels, gear 16, 2000 ticks and "
-                "unsigned current; expected slipid alone for other robots"
+                f"{path}: formats: robotino2022 is only for three wheels, gear ratio 16, 2000 "
+                "ticks and unsigned currents; expected the format slipid for other robots"
             )
 
 
@@ -238,9 +243,9 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
 def _map_sets(plan: SimulationPlan) -> list[tuple[str, str]]:
     """Return (load set-up, map) of the runs on maps that a fit can use.
 
-    These are the maps whose surfaces all have runs of their own, and the load set-ups that have
-    such runs. Poses of runs on maps are logged in the frame of the map, whichever pose steered
-    them.
+    These are the maps whose surfaces all have separate runs on them, and the load set-ups of such
+    runs. Poses of runs on maps are logged in the frame of the map, also if another pose was used
+    for steering.
     """
     one = [run for _, run in plan.runs if run.surface is not None]
     floors, loads = {run.surface for run in one}, {run.load for run in one}

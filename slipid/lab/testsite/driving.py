@@ -58,7 +58,7 @@ class Waypoints:
 
         It ends earlier if too much time passes: 10 s and three times the duration without slip.
         """
-        # the way from the start is not among the places: count that from the last place instead
+        # the start is not among the places: the leg from it is replaced by one from the last place
         corners = np.array([self.places[-1], *self.places])
         longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / self.speed
         pose, back = np.zeros(3), np.linalg.pinv(plant.robot.wheel_from_twist)
@@ -91,12 +91,12 @@ class SiteRun:
     """One run on the test site.
 
     Attributes:
-        surface: surface that its log names; None if the floor has several.
+        surface: surface named in the log; None if the floor has several.
         load: name of the load set-up.
         program: `TimedTwists` or `Waypoints`.
         start: start pose: x, y [m], heading [rad].
         floor: map of the floor; None if `surface` is everywhere.
-        place: name of the floor in file names; empty to use the surface's.
+        place: name of the floor in file names; empty to use the name of the surface.
     """
 
     surface: str | None
@@ -108,7 +108,7 @@ class SiteRun:
 
     @property
     def folder(self) -> str:
-        """Name of the folder of its log: that of the floor or, without one, of the surface."""
+        """Name of the folder of the log: that of the floor or, without one, that of the surface."""
         return self.place or str(self.surface)
 
     @property

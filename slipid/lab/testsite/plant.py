@@ -43,7 +43,7 @@ class SimulatedRobot:
 
     Args:
         site: the robot's build, its sensors and the surfaces.
-        floor: map of surfaces that the site knows.
+        floor: map of surfaces of the site.
         load: name of the load set-up.
         start: start pose: x, y [m], heading [rad].
         seed: seed of the initial wheel angles and of the floor's unevenness.
@@ -61,7 +61,7 @@ class SimulatedRobot:
     ):
         self.robot, self.dt = site.robot, timestep
         mujoco = engine()
-        # by default, MuJoCo writes warnings to a file; `check` uses the engine's own counts
+        # By default, MuJoCo writes warnings to a file; `check` uses the counts of the engine.
         mujoco.set_mju_user_warning(lambda text: None)
         self._step = mujoco.mj_step
         self.model = mujoco.MjModel.from_xml_string(
@@ -69,12 +69,12 @@ class SimulatedRobot:
         )
         self.data = mujoco.MjData(self.model)
         rng = np.random.default_rng(seed)
-        self._find(site.motor)
-        self._lay(Terrain(floor, site.surfaces, start, rng))
+        self._look_up(site.motor)
+        self._store_contacts(Terrain(floor, site.surfaces, start, rng))
         self.drive = WheelDrives(
             site.motor, site.loop, self.robot.gear_ratio, len(self.wheel_dof), timestep
         )
-        self._place(start, rng)
+        self._put(start, rng)
         self._count = 0
         for _ in range(round(SETTLING_S / timestep)):
             self.step([0.0] * len(self.wheel_dof))
@@ -103,7 +103,7 @@ class SimulatedRobot:
         if self._count % LOOKUP_STEPS == 0:
             self._look()
             if self._resists:
-                self._resist()
+                self._apply_resistance()
         self._count += 1
         angle, speed = d.qpos[self.wheel_at].tolist(), d.qvel[self.wheel_dof].tolist()
         d.qfrc_applied[self.wheel_dof] = self.drive.step(wanted, angle, speed)
@@ -112,7 +112,7 @@ class SimulatedRobot:
     def check(self) -> None:
         """Raise `DataError` if the simulation became unstable.
 
-        The engine itself only counts a warning, resets the robot and continues.
+        The engine only counts a warning, resets the robot and continues.
         """
         mujoco = engine()
         kinds = [f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC")]
@@ -124,7 +124,7 @@ class SimulatedRobot:
                 "expected smaller forces, gains or stiffness"
             )
 
-    def _find(self, motor: MotorBuild) -> None:
+    def _look_up(self, motor: MotorBuild) -> None:
         """Look up wheels and rollers in the engine's arrays, and set the motors' properties."""
         m, count = self.model, len(self.robot.wheel_azimuths_deg)
         joints = [m.joint(f"wheel{k}") for k in range(count)]
@@ -141,7 +141,7 @@ class SimulatedRobot:
         m.dof_frictionloss[self.wheel_dof] = motor.coulomb_nm
         m.dof_damping[self.wheel_dof] = motor.viscous_nms
 
-    def _lay(self, terrain: Terrain) -> None:
+    def _store_contacts(self, terrain: Terrain) -> None:
         """Store the contact parameters of every kind of floor in the terrain."""
         self.terrain = terrain
         kinds = terrain.kinds
@@ -154,7 +154,7 @@ class SimulatedRobot:
         self._beneath = np.full(len(self._roller), -1)
         self._low = np.full(len(self._roller), -1)
 
-    def _place(self, start: Pose, rng: np.random.Generator) -> None:
+    def _put(self, start: Pose, rng: np.random.Generator) -> None:
         """Put the robot at its start pose, with a random angle of every wheel."""
         q = self.data.qpos
         q[:2] = start[:2]
@@ -182,7 +182,7 @@ class SimulatedRobot:
             self._low = low
             m.dof_frictionloss[self._axle_dof] = np.where(low, self.robot.roller_friction_nm, 0.0)
 
-    def _resist(self) -> None:
+    def _apply_resistance(self) -> None:
         """Apply compaction forces on sunk wheels and the body drag as a wrench on the chassis."""
         d = self.data
         vx, vy, _, _, _, turn = d.qvel[:6].tolist()
@@ -202,5 +202,5 @@ class SimulatedRobot:
         fx, fy = fx - size * vx, fy - size * vy
         heading = self.pose[2]
         c, s = np.cos(heading), np.sin(heading)
-        mx, my = z0 * fy, -z0 * fx  # the force acts at the floor, z0 below the wheel axes
+        mx, my = z0 * fy, -z0 * fx  # The force acts at the floor, z0 below the wheel axes.
         d.qfrc_applied[:6] = [fx, fy, 0.0, c * mx + s * my, c * my - s * mx, moment]

@@ -87,7 +87,7 @@ class WheelDrives:
 
         Args:
             wanted: commanded wheel speeds [rad/s].
-            angle: angles of the wheels [rad]; the loop only sees whole encoder ticks.
+            angle: angles of the wheels [rad], which the loop measures in whole encoder ticks.
             speed: speeds of the wheels [rad/s], for the back-EMF.
         """
         m = self.motor
@@ -189,16 +189,19 @@ class RobotBuild:
 
     def __post_init__(self) -> None:
         if self.roller_radius_m >= self.wheel_radius_m:
-            raise ValueError("rollers as large as the wheel; expected smaller ones")
+            raise ValueError("the rollers are as large as the wheel; expected smaller rollers")
         if self.own_mass_kg <= 0:
-            raise ValueError(f"{self.mass_kg} kg is less than the wheels weigh; expected more")
+            raise ValueError(
+                f"mass_kg = {self.mass_kg} is less than the mass of the wheels; expected a larger "
+                "mass"
+            )
         if np.linalg.cond(self.wheel_from_twist * self.wheel_radius_m) > 100:
             raise ValueError(
-                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected them spread"
+                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected angles all around"
             )
         if not self.marker_height_m >= self.wheel_radius_m + 0.08:
             raise ValueError(
-                f"marker_height_m = {self.marker_height_m}; expected it 0.08 above the axes"
+                f"marker_height_m = {self.marker_height_m}; expected 0.08 above the wheel axes"
             )
         for name in self.centres_m:
             if not self.load_share(name).min() > 0.02:

@@ -31,7 +31,7 @@ from slipid.support.progress import Reporter
 
 
 def log_of(trace: Trace, site: Site, run: SiteRun, name: str, seed: int) -> Log:
-    """Return the log of a run: its trace as the site's sensors record it.
+    """Return the log of a run, with the errors of the site's sensors.
 
     Args:
         trace: true motion of the run.
@@ -137,18 +137,19 @@ def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Report
     interrupted simulation.
 
     Raises:
-        DataError: MuJoCo is missing, or the folder holds runs of another config.
+        DataError: MuJoCo is missing, or the folder contains runs of another config.
     """
     version = engine().__version__
     manifest = out / MANIFEST
     about = {"schema": SCHEMA, "config_hash": plan.hash, "mujoco": version}
     if manifest.is_file():
-        before = read_json(manifest, "what slipid simulate wrote")
+        before = read_json(manifest, "a result of `slipid simulate`")
         before = before if isinstance(before, dict) else {}
         for key, what in (("config_hash", "config"), ("mujoco", "version of MuJoCo")):
             if before.get(key) != about[key]:
                 raise DataError(
-                    f"{out}: holds runs of another {what}; expected an empty folder or the same"
+                    f"{out}: contains runs with another {what}; expected an empty folder or the "
+                    f"same {what}"
                 )
     write_json(manifest, about)
     _write_truth(plan, out)
@@ -211,7 +212,7 @@ def drive_and_write(task: SiteTask) -> float:
     """Drive one run, write its logs and its truth, and return the simulated duration [s]."""
     try:
         trace = drive(task.run, task.site, task.seed)
-    except ValueError as error:  # the engine also raises it for a robot that it cannot build
+    except ValueError as error:  # The engine also raises this for a robot that it cannot build.
         raise DataError(f"{task.name}: {error}") from error
     site = task.site
     gear, ticks = site.robot.gear_ratio, site.motor.ticks_per_revolution
@@ -266,7 +267,7 @@ def _write_truth(plan: SimulationPlan, out: Path) -> None:
         if all_filmed(plan):
             texts[out / "robot_video.toml"] = identify_config(plan, by_video=True)
         for path, text in texts.items():
-            if not path.is_file():  # an existing config is kept, since it may have been edited
+            if not path.is_file():  # An existing config is kept, since it may have been edited.
                 write_bytes(path, text.encode())
 
 

@@ -70,7 +70,9 @@ class SiteSensors:
 
     def __post_init__(self) -> None:
         if not 0.5 * self.frame_s <= self.lag_s <= 0.4:
-            raise ValueError(f"lag_s = {self.lag_s}; expected half of frame_s or above, up to 0.4")
+            raise ValueError(
+                f"lag_s = {self.lag_s}; expected at least half of frame_s, and at most 0.4"
+            )
 
     def amperes(
         self, true: Float[np.ndarray, "*batch"], rng: np.random.Generator

@@ -87,7 +87,7 @@ class Studio:
             self._renderer = mujoco.Renderer(self.model, height, width)
         except Exception as error:
             raise _drawing_error(error) from error
-        self._bent = self._lens()
+        self._distortion = self._lens()
         self._light = self._rng.uniform(0, 2 * np.pi, 2)
         size = (camera.height_px + _SHIFT, camera.width_px + _SHIFT, 3)
         self._grain = camera.noise * self._rng.standard_normal(size, np.float32)
@@ -112,7 +112,7 @@ class Studio:
         self._forward(self.model, self.data)
         self._renderer.update_scene(self.data, "overhead")
         drawn = np.ascontiguousarray(self._renderer.render()[:, :, ::-1])
-        return self._cv2.remap(drawn, *self._bent, self._cv2.INTER_LINEAR)
+        return self._cv2.remap(drawn, *self._distortion, self._cv2.INTER_LINEAR)
 
     def exposed(self, time: float, at: Callable[[float], tuple[Pose, Angles]]) -> np.ndarray:
         """Return a frame with motion blur, lens blur, flicker and noise.
@@ -180,7 +180,8 @@ def film(
         written = cv2.VideoCapture(str(unfinished)).get(cv2.CAP_PROP_FRAME_COUNT)
         if written != len(frames):
             raise DataError(
-                f"{path}: {written:.0f} of {len(frames)} frames written; is there room?"
+                f"{path}: only {written:.0f} of {len(frames)} frames were written; is the disk "
+                "full?"
             )
         os.replace(unfinished, path)
     finally:
@@ -201,14 +202,14 @@ def _drawing_modules() -> tuple[ModuleType, ModuleType]:
         raise DataError(
             f"the test site's camera needs {error.name}; expected: pip install 'slipid[testsite]'"
         ) from error
-    except AttributeError as error:  # PyOpenGL where libEGL is absent
+    except AttributeError as error:  # raised by PyOpenGL if libEGL is absent
         raise _drawing_error(error) from error
     return mujoco, cv2
 
 
 def _drawing_error(error: Exception) -> DataError:
     return DataError(
-        f"nothing can be drawn here ({error}); expected OpenGL without a screen: MUJOCO_GL=egl "
+        f"pictures cannot be drawn ({error}); expected OpenGL without a screen: MUJOCO_GL=egl "
         "and, on Debian and Ubuntu, apt-get install libegl1 libgl1-mesa-dri"
     )
 

@@ -1,4 +1,4 @@
-"""Physics of surfaces, and the floor as a roller meets it, with random unevenness and ribs."""
+"""Physics of surfaces, and contact parameters over the floor, with random unevenness and ribs."""
 
 from collections.abc import Mapping
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Controllers of a trial, each a row of its table: slipid's own and published control laws."""
+"""Controllers of a trial, the rows of its table: those of slipid and published control laws."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -14,7 +14,7 @@ from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.controller import Gains, Law, Limits
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.trajectory import STEP, rectangle
+from slipid.robot.trajectory import ROW_PERIOD, rectangle
 from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
 
@@ -45,7 +45,7 @@ def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     """
     path, actuators = rectangle(), ActuatorModel()
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
-    own = STEP * np.arange(len(rows))
+    own = ROW_PERIOD * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
     task = TuningTask(
         reference, np.array(TUNING_STARTS), actuators.command_weights(), actuators.lag_gain, PERIOD
@@ -57,7 +57,7 @@ ROWS: Mapping[str, ControllerRow] = {
     **CONTROLLERS,
     "goswami_padhy": ControllerRow(
         "encoder",
-        "law of Goswami and Padhy, gains by a swarm",
+        "law of Goswami and Padhy, gains by particle swarm",
         law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("swarm"))),
     ),
     "goswami_padhy_gradient": ControllerRow(
@@ -66,7 +66,7 @@ ROWS: Mapping[str, ControllerRow] = {
         law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("gradient"))),
     ),
     "indiveri": ControllerRow(
-        "encoder", "law of Indiveri, its limit keeps the direction", law=_indiveri
+        "encoder", "law of Indiveri, with a limit that keeps the direction", law=_indiveri
     ),
 }
 """Controllers by name: those of slipid and of the 2021 paper, then the published laws."""
@@ -81,8 +81,8 @@ def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
     kept = tuple(name for name in names if ROWS[name].drives(robot))
     if not kept:
         raise DataError(
-            f"{', '.join(names)}: for robots with {PAPER_WHEELS} wheels, as that of the 2021 "
-            f"paper; this one has {robot.wheels}, expected some of "
+            f"{', '.join(names)}: only for robots with {PAPER_WHEELS} wheels, like that of the "
+            f"2021 paper; this robot has {robot.wheels}; expected some of "
             f"{', '.join(name for name, row in ROWS.items() if row.drives(robot))}"
         )
     return kept
@@ -113,12 +113,12 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
-            f"{tuned.loss.hand:.1f} mm): driving with those set by hand; --tuned-gains takes the "
-            "others"
+            f"{tuned.loss.hand:.1f} mm): driving with those set by hand; use --tuned-gains for "
+            "the tuned ones"
         )
     if tuned.values.ahead.value == 0.0:
         return ""
     return (
-        f"tuned gain ahead = {tuned.values.ahead.value:g} is not taken: there are no wheel speeds "
-        "by the contact model any more"
+        f"tuned gain ahead = {tuned.values.ahead.value:g} is ignored: controllers no longer use "
+        "wheel speeds of the contact model"
     )

@@ -20,9 +20,9 @@ Nothing is tuned: gains are the hand-set ones of slipid's pose loop.
 
 Liberties:
 
-- The law is implemented from its equations as other papers quote them; the text of the paper itself
-  was not available. Its other treatments of wheels at their limit are not included; here one factor
-  scales translation and turning together.
+- The law is implemented from its equations in other papers; the text of the paper itself was not
+  available. Its other treatments of wheels at their limit are not included; here one factor scales
+  translation and turning together.
 - The gains are not those of the paper. The row `encoder` has the same gains. It differs from this
   one by the sine of the heading error, and by the scaling above, after which the limits of all rows
   apply once more: while no wheel is at its limit, the two rows are nearly the same.
@@ -68,7 +68,7 @@ def inverse_kinematics(
         wheel = int(np.abs(across).argmin())
         raise ValueError(
             f"wheel {wheel + 1}: rollers at {np.degrees(roller_angle[wheel]):g} deg to the drive "
-            "direction, such a wheel cannot drive; expected anything away from 0 and 180"
+            "direction, so that the wheel cannot drive; expected an angle not near 0 or 180"
         )
     normal = drive_angle - roller_angle + 0.5 * np.pi
     n = np.stack([np.cos(normal), np.sin(normal)], axis=1)

@@ -18,7 +18,7 @@ from slipid.support.errors import DataError
 
 def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
     """Raise `DataError` if the test site lacks a surface, the load set-up or so many wheels."""
-    robot, other = Site().robot, "With --plant twin the identified model is driven itself"
+    robot, other = Site().robot, "With --plant twin, the identified model itself is simulated"
     has = len(robot.wheel_azimuths_deg)
     if wheels != has:
         raise DataError(f"the test site's robot has {has} wheels, the fit's {wheels}. {other}")

@@ -15,7 +15,7 @@ from slipid.lab.trial.trial import TrialResult
 from slipid.plots.drawing import INK, ORANGE, SERIES, SHADE, figure, plain, save
 from slipid.support.content import Content
 
-TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
+SURFACE_COLOURS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Colours of surfaces, in the order of the map's surfaces."""
 FAINT = SERIES[4]
 """Colour of the paths from all starts but the highlighted one, which is orange."""
@@ -53,7 +53,7 @@ def _verdict(content: Content) -> str:
     """Return a title that names the controller with the smallest closure error, if one is best."""
     best = content["closes_best"]
     if best is None:
-        return f"{', '.join(content['not_told_apart'])} are not distinguished"
+        return f"{', '.join(content['not_told_apart'])} do not differ significantly"
     ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
     return f"{best} closes best" + (f", {100 * ratio['value']:.0f} % of encoders'" if ratio else "")
 
@@ -85,7 +85,7 @@ def _paths_panel(axes: Axes, name: str, trial: TrialResult, one: int) -> None:
     start = runs[one]["start"]
     places = start[:2] + np.stack(np.meshgrid(x, y), -1) @ _rotation(start[2]).T
     kinds = max(len(floor.surfaces), 2)
-    tints = ListedColormap(TINTS[:kinds])
+    tints = ListedColormap(SURFACE_COLOURS[:kinds])
     axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
     for p in own:
         axes.plot(*p.T, color=FAINT, lw=0.5, alpha=0.6)
@@ -106,9 +106,9 @@ def _legend(drawing: Figure, floor: FloorMap) -> None:
     """Add the legend of floor tints and lines."""
     patches = [
         Patch(facecolor=tint, edgecolor=SHADE, label=name)
-        for name, tint in zip(floor.surfaces, TINTS, strict=False)
+        for name, tint in zip(floor.surfaces, SURFACE_COLOURS, strict=False)
     ]
-    typical = "the start typical of encoders"
+    typical = "typical start of `encoder`"
     lines = [
         Line2D([], [], color=INK, ls="--", lw=1.0, label="wanted"),
         Line2D([], [], color=FAINT, lw=1.0, label="every start"),

@@ -55,8 +55,8 @@ class TrialTask:
         start: start pose [m, m, rad].
         seed: seed of all random numbers.
         plant: `testsite` or `twin`.
-        floor: map of the floor that is driven on.
-        known_map: map of the floor that controllers are given.
+        floor: map of the floor on which the robot drives.
+        known_map: map of the floor that is given to controllers.
         robot: identified robot.
         settings: settings of the estimator.
         actuators: delay, lag and limits of the twin's wheel speeds.
@@ -86,7 +86,8 @@ class TrialOptions:
     Attributes:
         plant: `testsite` (MuJoCo) or `twin` (the identified model itself, with parameters drawn
             anew from the posterior for every start).
-        map: file of the floor map that is driven on; None for patches of the identified floors.
+        map: file of the map of the floor on which the robot drives; None for patches of the
+            identified floors.
         told_map: file of the map that is given to controllers with a map; None for the true one.
         controllers: names of controllers, keys of `ROWS`.
         path: name of the path, a key of `trajectory.PATHS`.
@@ -116,7 +117,7 @@ class TrialResult:
         runs: runs that the content summarises.
         paths: true poses (step, 3) of every run, by its name.
         wanted: positions on the reference path, from the origin (row, 2) [m].
-        floor: map of the floor that was driven on.
+        floor: map of the floor on which the robot drove.
     """
 
     content: dict[str, Any]
@@ -129,18 +130,18 @@ class TrialResult:
 def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter) -> TrialResult:
     """Drive every controller from every start, and write trial.json.
 
-    Finished runs are saved, and not driven again unless something that they depend on changes.
+    Finished runs are saved, and are not driven again unless something on which they depend changes.
 
     Raises:
         DataError: there is no fit in the folder; the plant, a controller, the path, the load set-up
-            or a map does not exist; MuJoCo is missing; the plant or the fit does not know a floor;
-            or the speed is beyond those of the fit.
+            or a map does not exist; MuJoCo is missing; a floor is unknown to the plant or the fit;
+            or the speed is higher than those of the fitted runs.
     """
     setup_jax(quiet=True)
     tasks = _tasks(out, options)
     rows = tuple(dict.fromkeys(task.row for task in tasks))
     if unsuited := [name for name in options.controllers if name not in rows]:
-        report.line(f"left out, for robots with three wheels: {', '.join(unsuited)}")
+        report.line(f"left out, since they are for robots with three wheels: {', '.join(unsuited)}")
     if unused := unused_gains(tasks[0].robot, options.tuned_gains):
         report.line(unused)
     todo = {task.name: task for task in tasks if _finished_run(task) is None}
@@ -194,7 +195,7 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     key = key_of(
         *(*about, settings, actuators, *jax.tree.leaves(robot)),
         *(part for m in (floor, known_map) for part in (m.surfaces, m.corner, m.cell, m.cells)),
-        # runs of another version of this code are not reused
+        # Runs of another version of this code are not reused.
         source_hash("robot", "model", "lab/testsite", "data", "deploy", "lab/trial"),
     )
     # trials with other gains or floors have separate folders, so that their runs stay reusable

@@ -1,22 +1,23 @@
 """Effects of floors: their estimates from the fitted runs, and their correlation over a path.
 
 An effect is a constant error of the model on a floor: motion along, across and in yaw that the
-model misses, per metre that the wheels would roll without slip [m/m, m/m, rad/m]. It belongs to a
-floor and to a direction of travel u, the unit vector of the twist without slip, its yaw rate
-multiplied by the base radius. Its estimates from the fitted runs, a mean and a remaining std, are a
-table over directions and speeds (`EffectLookup`). An effect e, in units of its remaining std,
-decorrelates as the direction changes, and once the robot has left the floor:
+model does not predict, per metre that the wheels would roll without slip [m/m, m/m, rad/m]. It
+belongs to a floor and to a direction of travel u, the unit vector of the twist without slip, its
+yaw rate multiplied by the base radius. Its estimates from the fitted runs, a mean and a remaining
+std, are a table over directions and speeds (`EffectLookup`). An effect e, in units of its remaining
+std, decorrelates as the direction changes, and once the robot has left the floor:
 
-    k = exp(-(1 - a^2) |u - v|^2 / (2 TURN^2) - left far / AWAY),   a = exp(-far / SETTLES)
+    a = exp(-far / SETTLING_LENGTH)
+    k = exp(-(1 - a^2) |u - v|^2 / (2 DIRECTION_STD^2) - left far / LEAVING_LENGTH)
     e <- k e + sqrt(1 - k^2) noise,   v <- u + a (v - u)
 
 with `far` the path length of the step [m], v the settled direction, a low-pass filtered u, and
 `left` 1 if no wheel is on the floor, else 0. If the direction changes at once from v to u, the
-correlation becomes exp(-|u - v|^2 / (2 TURN^2)), in however many steps it is computed; jitter of
-the direction barely changes it, and on a drive back the effect is independent of the earlier one.
-Along an arc of curvature c [1/m] on which the direction turns by an angle [rad] the correlation
-falls more slowly, to about exp(-angle c SETTLES / TURN^2): after a quarter turn on a radius of one
-metre it is a fifth.
+correlation becomes exp(-|u - v|^2 / (2 DIRECTION_STD^2)), in however many steps it is computed;
+jitter of the direction barely changes it, and on a drive back the effect is independent of the
+earlier one. Along an arc of curvature c [1/m] on which the direction turns by an angle [rad] the
+correlation falls more slowly, to about exp(-angle c SETTLING_LENGTH / DIRECTION_STD^2): after a
+quarter turn on a radius of one metre it is a fifth.
 """
 
 import equinox as eqx
@@ -25,17 +26,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-TURN = 0.17
+DIRECTION_STD = 0.17
 """Width of the Gaussian over changes of direction with which an effect decorrelates [rad]: 10 deg,
 estimated from real logs."""
-SETTLES = 0.03
+SETTLING_LENGTH = 0.03
 """Path length constant of the low-pass filter of the direction of travel [m]."""
-AWAY = 0.1
+LEAVING_LENGTH = 0.1
 """Path length off a floor over which its effect decorrelates by a factor of e [m]."""
-FORGETS = 0.5
+LOG_SPEED_STD = 0.5
 """Width of the Gaussian over log speed with which estimates fade to 0 outside the speeds of the
 table [1]; the fit uses the same value."""
-TRAVELS = 0.2
+TRAVEL_SHARE = 0.2
 """Ratio of translational speed to `RolledMotion.speed` above which a robot counts as travelling in
 a direction, not as turning on the spot [1]; the fit uses the same value."""
 
@@ -46,9 +47,9 @@ class RolledMotion(eqx.Module):
     Attributes:
         speed: speed of the body plus base radius times its absolute yaw rate [m/s].
         axes: directions along, across and in yaw, as columns in the body frame.
-        straight: speed of the body without its turn [m/s].
+        straight: translational speed of the body [m/s].
         angle: direction of travel in the body frame [rad].
-        travels: whether the body travels in a direction rather than turning on the spot.
+        travels: True if the body travels in a direction rather than turning on the spot.
     """
 
     speed: Float[Array, ""]
@@ -68,7 +69,7 @@ class RolledMotion(eqx.Module):
             axes=jnp.array([[u[0], -u[1], 0.0], [u[1], u[0], 0.0], [0.0, 0.0, 1.0]]),
             straight=straight,
             angle=jnp.arctan2(u[1], u[0]),
-            travels=straight > TRAVELS * speed,
+            travels=straight > TRAVEL_SHARE * speed,
         )
 
 
@@ -93,8 +94,8 @@ class EffectLookup(eqx.Module):
     def at(self, rolled: RolledMotion) -> tuple[Float[Array, "floor 3"], Float[Array, "floor 3"]]:
         """Return the mean effect on every floor, and the remaining fraction of its std.
 
-        The table is interpolated linearly over directions and speeds; beyond its speeds the
-        estimates fade.
+        The table is interpolated linearly over directions and speeds; outside the range of its
+        speeds the estimates fade to 0.
         """
         around = self.table.shape[2]
         place = jnp.mod(rolled.angle / (2 * jnp.pi), 1.0) * around
@@ -104,7 +105,7 @@ class EffectLookup(eqx.Module):
         corners = self.table[:, near[:, None], columns]
         by_direction = jnp.stack([1 - (place - first), place - first])
         row = jnp.einsum("s,d,fsdk->fk", weight, by_direction, corners)
-        fade = jnp.where(rolled.travels, jnp.exp(-0.5 * (beyond / FORGETS) ** 2), 0.0)
+        fade = jnp.where(rolled.travels, jnp.exp(-0.5 * (beyond / LOG_SPEED_STD) ** 2), 0.0)
         return fade * row[:, :3], jnp.sqrt(1 - fade**2 * (1 - row[:, 3:] ** 2))
 
     def _speeds(self, log_speed: Array) -> tuple[Array, Array, Array]:
@@ -144,8 +145,8 @@ def effect_correlation(
         left: probability that no wheel is on the floor [1].
         far: path length of the step [m].
     """
-    a = jnp.exp(-far / SETTLES)
+    a = jnp.exp(-far / SETTLING_LENGTH)
     before = jnp.where(before @ before > 0, before, now)
     gap = before - now
-    turned = (1 - a**2) * (gap @ gap) / (2 * TURN**2)
-    return now + a * gap, jnp.exp(-turned - left * far / AWAY)
+    turned = (1 - a**2) * (gap @ gap) / (2 * DIRECTION_STD**2)
+    return now + a * gap, jnp.exp(-turned - left * far / LEAVING_LENGTH)

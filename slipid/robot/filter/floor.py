@@ -1,9 +1,9 @@
-"""A floor map for jitted functions, and the evidence that it gives on floors and pose.
+"""A floor map for jitted functions, and its evidence about floors and pose.
 
 With a map, the estimated pose and its covariance determine which floors are likely under the
 wheels. Poses x_s are a fixed set of samples, scaled by the root of the covariance. The map gives
 the probability W_sc of every hypothesis c (one floor under each wheel) at each pose x_s; the mean
-over poses is the prior of c. [...] is 1 where it is true, else 0:
+over poses is the prior of c. [...] is 1 if its content is true, else 0:
 
     W_sc ~ prod_wheel ((1 - leak) [map at the wheel of x_s is c's] + leak / floors),  sum_c W_sc = 1
     prior_c = mean_s W_sc
@@ -14,7 +14,7 @@ changes the probability of each pose (`slipid.robot.filter.pose_fix.apply_map`):
     P(x_s) ~ (sum_c p_c' W_sc / prior_c  /  sum_c p_c W_sc / prior_c)^(1/4)
 
 so that crossing an edge at an unexpected place corrects the pose. Evidence corrects the pose only
-in the step in which it arrives; without evidence the map does not move the pose.
+in the step in which it is measured; without evidence the map does not change the pose.
 """
 
 from collections.abc import Sequence
@@ -31,16 +31,16 @@ from jaxtyping import Array, Float, Int
 from slipid.support.errors import DataError
 from slipid.support.files import write_arrays
 
-LEAK = 0.1
+MAP_ERROR = 0.1
 """Probability that the map shows the wrong floor under a wheel [1]."""
-HALF = 16
+SAMPLE_PAIRS = 16
 """Number of pairs of opposite pose samples."""
 
 
 def _spread() -> Float[np.ndarray, "sample 3"]:
     """Return pose samples whose mean is exactly 0 and whose covariance is exactly the identity."""
-    draws = np.random.default_rng(0).normal(size=(HALF, 3))
-    draws = draws @ np.linalg.inv(np.linalg.cholesky(draws.T @ draws / HALF)).T
+    draws = np.random.default_rng(0).normal(size=(SAMPLE_PAIRS, 3))
+    draws = draws @ np.linalg.inv(np.linalg.cholesky(draws.T @ draws / SAMPLE_PAIRS)).T
     return np.concatenate([draws, -draws])
 
 
@@ -51,8 +51,8 @@ class Floor(eqx.Module):
     """Map of surfaces as arrays that a jitted function can look up.
 
     Attributes:
-        cells: number of the surface in every square cell (row, column), row 0 at the lowest y; -1
-            for a surface that the robot does not know.
+        cells: index of the surface in every square cell (row, column), row 0 at the lowest y; -1
+            for a surface that was not identified.
         corner: x, y of the corner with the lowest coordinates [m].
         cell: edge of a cell [m].
     """
@@ -70,13 +70,13 @@ class Floor(eqx.Module):
         cell: float,
         labels: Sequence[str],
     ) -> "Floor":
-        """Return the map for a robot's labels, from cells that number the map's own surfaces."""
+        """Return the map for a robot's labels, from cells that contain indices into `surfaces`."""
         numbers = [labels.index(name) if name in labels else -1 for name in surfaces]
         numbered = np.array(numbers)[np.asarray(cells)]
         return cls(jnp.asarray(numbered), jnp.asarray(corner), jnp.asarray(cell))
 
     def save(self, path: Path | str, labels: Sequence[str]) -> None:
-        """Write the map of a robot with these labels as a file that numpy alone can read.
+        """Write the map of a robot with these labels as a file that can be read with numpy alone.
 
         Raises:
             DataError: the file cannot be written.
@@ -86,25 +86,25 @@ class Floor(eqx.Module):
 
     @classmethod
     def load(cls, path: Path | str, labels: Sequence[str]) -> "Floor":
-        """Return the map of a file that `save` wrote, for a robot with these labels.
+        """Return the map in a file written by `save`, for a robot with these labels.
 
         Raises:
-            DataError: the file is absent or not such a map.
+            DataError: the file is absent or is not such a map.
         """
         try:
             with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as file:
-                names = [*file["labels"].tolist(), ""]  # -1 stands for an unknown surface
+                names = [*file["labels"].tolist(), ""]  # -1 means an unknown surface
                 corner, cell = tuple(file["corner"].tolist()), float(file["cell"])
                 return cls.of(names, file["cells"], corner, cell, labels)
         except (OSError, ValueError, LookupError, TypeError, EOFError, BadZipFile) as error:
-            raise DataError(f"{path}: {error}; expected a map that Floor.save wrote") from error
+            raise DataError(f"{path}: {error}; expected a map written by Floor.save") from error
 
     def under(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
     ) -> Int[Array, " wheel"]:
         """Return the number of the surface under each wheel of a robot at a pose.
 
-        Beyond the edge of the map it is that of the nearest cell.
+        Outside the map it is the surface of the nearest cell.
 
         Args:
             pose: x, y [m] and heading [rad].
@@ -144,5 +144,5 @@ class Floor(eqx.Module):
         poses = pose + SPREAD @ root.T
         under = jax.vmap(self.under, (0, None))(poses, wheels)
         same = under[:, None, :] == jnp.asarray(hypotheses)
-        weight = jnp.prod((1 - LEAK) * same + LEAK / floors, axis=-1)
+        weight = jnp.prod((1 - MAP_ERROR) * same + MAP_ERROR / floors, axis=-1)
         return weight / jnp.sum(weight, axis=-1, keepdims=True)

@@ -1,7 +1,7 @@
 """Filter over the floors under the wheels, with one hypothesis for all wheels together.
 
-A robot whose wheels stand on several floors moves as one body, so every hypothesis is one floor per
-wheel (`hypotheses`), and one more is "unknown":
+All wheels move the same body, so every hypothesis assigns a floor to each wheel (`hypotheses`); one
+further hypothesis is "unknown":
 
     xi_c, I_c     contact equilibrium with the estimated effect of a single floor, and motor
                   currents, of hypothesis c at the wheel speeds
@@ -45,7 +45,7 @@ class TimeStep(eqx.Module):
 
     Attributes:
         dt: duration as `slipid.robot.filter.wheels.time_step` returns it [s].
-        moves: whether a wheel turns.
+        moves: True if a wheel turns.
         acceleration: acceleration of the fastest changing wheel [rad/s^2].
     """
 
@@ -122,12 +122,13 @@ class FloorFilter(eqx.Module):
     def prior(self) -> Float[Array, " hypothesis"]:
         """Return the probability of every hypothesis before any measurement.
 
-        All floors without a run together are as improbable as one further floor under the robot.
+        All hypothetical floors (`slipid.robot.unseen`) together have the prior probability of one
+        further floor under the robot.
         """
         under = hypotheses_of(self.robot).under
         kinds = np.array([len(set(row)) for row in under.tolist()])
         unseen = np.array(self.robot.unseen)[under[:, 0]]
-        further = kinds - 1 + unseen  # floors beyond the first one under the robot
+        further = kinds - 1 + unseen  # number of further floors under the robot
         weight = jnp.exp(-self.settings.further_floor_penalty * further) / np.where(
             unseen, unseen.sum(), 1
         )
@@ -142,10 +143,10 @@ class FloorFilter(eqx.Module):
         tick: TimeStep,
         mapped: Float[Array, " hypothesis"] | None = None,
     ) -> tuple[FloorState, BodyMotion]:
-        """Return the beliefs one time step later, and the motion that follows from them.
+        """Return the belief one time step later, and the resulting motion.
 
         Args:
-            old: beliefs before the step.
+            old: belief before the step.
             w: wheel speed of every drive [rad/s].
             currents: motor currents.
             turn: yaw rate by the gyro without its bias, NaN without a gyro [rad/s].
@@ -161,23 +162,23 @@ class FloorFilter(eqx.Module):
         effect = rolled.speed * mean @ rolled.axes.T
         xi = settled + jnp.zeros((len(hypotheses), 3)).at[hypotheses.uniform].set(effect)
         known_log, unknown_log = self._evidence(xi, predicted, currents, w, turn)
-        # evidence weighs less while wheels accelerate, since the equilibrium lacks inertia
+        # Evidence has less weight while wheels accelerate, since the equilibrium neglects inertia.
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
         weight = weight / (1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2)
-        prior, apart = self._mixed(old, xi, tick, mapped)
+        prior, apart = self._after_floor_changes(old, xi, tick, mapped)
         log = jnp.log(jnp.maximum(prior, 1e-12)) + weight * jnp.append(known_log, unknown_log)
         belief = jax.nn.softmax(log)
         known = belief[:-1] / jnp.maximum(jnp.sum(belief[:-1]), 1e-12)
         middle = known @ xi
         before = prior[:-1] / jnp.maximum(jnp.sum(prior[:-1]), 1e-12)
-        apart, jump = self._moved(apart, known, xi, turn, tick)
+        apart, jump = self._relative_poses(apart, known, xi, turn, tick)
         under = jnp.einsum("c,cwf->wf", known, hypotheses.on.astype(float))
         motion = BodyMotion(
             twist=middle,
             scatter=(xi - middle).T @ (known[:, None] * (xi - middle)),
             rolling=rolling,
             rolled=rolled,
-            left=f.effect * self._left(part, known, under),
+            left=f.effect * self._remaining_std(part, known, under),
             by_friction=self._by_friction(known @ settled, w, under),
             known=known,
             before=before,
@@ -189,10 +190,10 @@ class FloorFilter(eqx.Module):
         expected = old.expected if mapped is None else mapped
         return FloorState(belief, expected, twist=settled, apart=apart), motion
 
-    def _left(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
+    def _remaining_std(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Return the remaining std of every floor's effects as a fraction of the whole std [1].
 
-        With wheels on several floors the whole std remains, since the estimates hold for all wheels
+        With wheels on several floors the whole std remains, since the estimates are for all wheels
         on one floor.
         """
         alone = known[hypotheses_of(self.robot).uniform]
@@ -222,7 +223,7 @@ class FloorFilter(eqx.Module):
         """Return the derivative of a twist by the log friction of each floor under the wheels.
 
         It follows from the balance of forces. Its magnitude is limited to the body's speed, since
-        linearization fails where all wheels slide.
+        linearization fails if all wheels slide.
         """
         f = self.robot
         rim = f.frame.radius * f.at_wheels(w)
@@ -233,7 +234,7 @@ class FloorFilter(eqx.Module):
         def force(mu: Array) -> Planar:
             return Balance(rim, replace(on, floor=replace(on.floor, friction=mu))).force(xi)
 
-        def pushed(part: Array) -> Planar:  # frictions are relative to their mean
+        def pushed(part: Array) -> Planar:  # Friction coefficients are divided by their mean.
             return jax.jvp(force, (mu,), (part - mu * jnp.mean(part),))[1]
 
         slope = solve3(Balance(rim, on).jacobian(xi), jax.vmap(pushed)(each.T))
@@ -262,12 +263,12 @@ class FloorFilter(eqx.Module):
         counts = jnp.append(measured > 0, jnp.isfinite(turn))
         worst = (s.unknown_std + 1.0) ** 2
         score = jnp.sum(jnp.where(counts, jnp.minimum(gap**2 / var, worst), 0.0), axis=1)
-        # one logarithm of a product costs a robot's computer less than several logarithms
+        # One logarithm of a product is cheaper than several logarithms.
         spread = jnp.prod(jnp.where(counts, var / jnp.mean(var, axis=0), 1.0), axis=1)
         return -0.5 * (score + jnp.log(spread)), -0.5 * s.unknown_std**2 * jnp.sum(counts)
 
     def _of_friction(self, amps: Float[Array, "hypothesis drive"]) -> Array:
-        """Return the variance of currents that uncertain frictions of several floors cause [A^2].
+        """Return the variance of currents due to uncertain friction of several floors [A^2].
 
         A wheel bears a fraction of the total drag in proportion to its floor's friction divided by
         the mean friction.
@@ -280,12 +281,12 @@ class FloorFilter(eqx.Module):
     def _stiction(self, w: Array) -> Array:
         """Return the variance of the current of a wheel at rest [A^2]; it is 0 for a turning one.
 
-        Static friction lets the current lie anywhere between two bounds, taken as uniform.
+        Static friction lets the current lie anywhere between two bounds; it is assumed uniform.
         """
         motor = self.robot.motor
         return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
 
-    def _mixed(
+    def _after_floor_changes(
         self, old: FloorState, xi: Array, tick: TimeStep, mapped: Array | None
     ) -> tuple[Array, Array]:
         """Return probabilities and relative poses after wheels may have changed floors."""
@@ -300,7 +301,8 @@ class FloorFilter(eqx.Module):
             fresh, whole = mapped, _followed(whole, old.expected, mapped, change)
         stayed = whole[:, 0] * (1 - 0.05 * change)
         of_known = stayed + 0.2 * change * unknown * fresh
-        # the probability that returns from "unknown" has the mean pose, relative pose 0
+        # The probability that returns from "unknown" gets the mean pose, which has the relative
+        # pose 0.
         apart = whole[:, 1:] * ((1 - 0.05 * change) / of_known)[:, None]
         of_none = unknown * (1 - 0.2 * change) + 0.05 * change * sure
         return jnp.append(of_known, of_none), apart
@@ -319,7 +321,7 @@ class FloorFilter(eqx.Module):
         return self._unseen_changed(p, change)
 
     def _unseen_changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
-        """Return the belief after the whole robot may have moved to or from a floor without a run.
+        """Return the belief after the whole robot may have moved to or from a hypothetical floor.
 
         Such a change is as improbable as one to the "unknown" floor.
         """
@@ -334,14 +336,14 @@ class FloorFilter(eqx.Module):
         own = p[whole]
         return p.at[whole].set((1 - leaves) * own + to.T @ own)
 
-    def _moved(
+    def _relative_poses(
         self, apart: Array, known: Array, xi: Array, turn: Array, tick: TimeStep
     ) -> tuple[Array, Array]:
         """Return poses of the hypotheses relative to their mean, and the jump of the mean pose.
 
         The jump is the change of the mean pose beyond the mean twist; late evidence on the floors
-        causes it. Each hypothesis continues from its own pose with its own twist; the yaw rate of a
-        gyro, if there is one, replaces that of all twists.
+        causes it. Each hypothesis continues from its pose with its twist; the yaw rate of a gyro,
+        if there is one, replaces that of all twists.
         """
         xi = xi.at[:, 2].set(jnp.where(jnp.isfinite(turn), turn, xi[:, 2]))
         poses = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, tick.dt))

@@ -1,11 +1,11 @@
-"""Hypotheses of the floors under the wheels of a robot, all wheels together.
+"""Hypotheses about the floors under all wheels of a robot.
 
 The number of assignments, floors to the power of wheels, grows fast: 625 for four wheels on five
 floors. The edge of a floor is nearly straight on the scale of a robot, so going around the robot
 from wheel to wheel the floor changes at most twice: every hypothesis has one floor, or two with
-neighbouring wheels on each side. That leaves 125 of the 625, and 21 of three wheels' 27. Three
-floors at once, where patches meet at a corner, fall to the nearest of these or to "unknown". A
-floor without a run is under all wheels or under none.
+neighbouring wheels on each side. That leaves 125 of the 625, and 21 of the 27 for three wheels.
+Three floors at once, where patches meet at a corner, are represented by the most similar of these
+or by "unknown". A hypothetical floor (`slipid.robot.unseen`) is under all wheels or under none.
 """
 
 import itertools
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Int
 
 from slipid.robot.deployed import RobotArrays
 
-CHANGES = 2
+MOST_CHANGES = 2
 """Largest number of pairs of neighbouring wheels around the robot that stand on two floors."""
 
 
@@ -27,11 +27,10 @@ class Hypotheses:
 
     Attributes:
         under: number of the floor under each wheel.
-        beside: for each wheel, hypothesis and floor, index of the hypothesis that has this floor
-            under this wheel and the other wheels unchanged; where there is none, the number of
-            hypotheses.
+        beside: for each wheel, hypothesis and floor, index of the hypothesis with this floor under
+            this wheel and the other wheels unchanged; if there is none, the number of hypotheses.
         uniform: for each floor, the hypothesis that has it under all wheels.
-        on: whether the floor is under the wheel.
+        on: True if the floor is under the wheel.
     """
 
     under: Int[np.ndarray, "hypothesis wheel"]
@@ -44,8 +43,8 @@ class Hypotheses:
 
 
 def hypotheses_of(robot: RobotArrays) -> Hypotheses:
-    """Return the hypotheses of a robot on the floors that it knows."""
-    return _hypotheses(robot.around, robot.unseen, CHANGES)
+    """Return the hypotheses of a robot on its identified floors."""
+    return _hypotheses(robot.around, robot.unseen, MOST_CHANGES)
 
 
 @lru_cache(maxsize=32)

@@ -1,10 +1,10 @@
 """Filter of the pose and its covariance, with the errors of the model as further states.
 
-Process noise and effects increase the covariance. The effects, the floors' friction and a gyro's
-bias are unknowns that pose fixes and rests correct. Friction affects the motion only where wheels
-stand on several floors, so runs on a single floor each leave it undetermined. Uncertainty about the
-floors is the scatter S of the hypotheses' twists xi_c about their mean xi, with probabilities p_c.
-An error d of the belief persists for a while:
+Process noise and effects increase the covariance. The effects, the friction of the floors and the
+bias of a gyro are unknowns that are corrected by pose fixes and during rests. Friction affects the
+motion only if wheels stand on several floors, so runs on one floor each do not determine it.
+Uncertainty about the floors is the scatter S of the hypotheses' twists xi_c about their mean xi,
+with probabilities p_c. An error d of the belief persists for a while:
 
     S = sum_c p_c (xi_c - xi) (xi_c - xi)^T = L L^T,   xi_true = xi + L d,   d ~ N(0, 1)
     d <- k d + sqrt(1 - k^2) noise,   k = exp(-far / doubt_m)
@@ -26,7 +26,7 @@ from slipid.robot.filter.effects import effect_correlation, travel_direction
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import INERTIA_ACCELERATION, BodyMotion, TimeStep, length
 from slipid.robot.filter.pose_fix import (
-    HISTORY,
+    HISTORY_STEPS,
     PoseState,
     apply_fix,
     history_after_jump,
@@ -36,7 +36,7 @@ from slipid.robot.filter.pose_fix import (
 from slipid.robot.interface import Readings, Settings
 
 CREEP_SPEED = 0.05
-"""Speed below which the gyro does not correct the contact model, since no fitted run is as slow
+"""Below this speed the gyro does not correct the contact model, since fitted runs are faster
 [m/s]."""
 
 
@@ -85,7 +85,7 @@ class PoseFilter(eqx.Module):
             noise=jnp.zeros((3, 3)),
             far=jnp.zeros(()),
             push=jnp.zeros((3, 4 * floors + 3)),
-            history=jnp.broadcast_to(entry, (HISTORY, 15)),
+            history=jnp.broadcast_to(entry, (HISTORY_STEPS, 15)),
         )
 
     def mapped(
@@ -114,14 +114,16 @@ class PoseFilter(eqx.Module):
         dt = tick.dt
         body = self._step_motion(motion, gyro)
         old = self._forgotten(old, motion, tick)
-        free = motion.twist + body.slope @ old.nuisance[:-1]  # at any speed: slow creep adds up
+        free = (
+            motion.twist + body.slope @ old.nuisance[:-1]
+        )  # at any speed, since even a slow motion adds up
         old = replace(old, history=old.history.at[:, 0].add(dt))
         twist = free.at[2].set(self._turned(old, free[2], gyro))
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
         still = jnp.where(tick.moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         old = replace(old, history=history_after_jump(old, motion, self.robot.frame.base))
-        new = replace(self._grow(old, pose, body, tick), still=still)
-        new = self._rest(self._turns(new, body, gyro, free[2], tick), gyro)
+        new = replace(self._moved(old, pose, body, tick), still=still)
+        new = self._bias_at_rest(self._gyro_update(new, body, gyro, free[2], tick), gyro)
         begun, ended = jnp.concatenate([jnp.zeros(1), new.pose, free[2:]]), new.far[None]
         entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
@@ -134,7 +136,7 @@ class PoseFilter(eqx.Module):
         speed, axes = motion.rolled.speed, motion.rolled.axes
         std = speed * share[:, None] * motion.left
         by_effect = (std[:, :, None] * axes.T).reshape(-1, 3).T
-        # covariance per metre, so that a robot at rest has no doubt about its motion
+        # The covariance is per metre, so that it does not grow while the robot is at rest.
         per_metre = motion.scatter / jnp.maximum(speed**2, 1e-12)
         doubt = speed * axes @ cholesky_root(axes.T @ per_metre @ axes)
         return _StepMotion(
@@ -178,10 +180,10 @@ class PoseFilter(eqx.Module):
         """Return the yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
         delay = self.settings.gyro_delay_s
         if not isinstance(delay, jax.core.Tracer) and float(delay) == 0.0:
-            return free  # so exported code of a robot without delay has no search
+            return free  # no delay: avoid the search, also in exported code
         return jnp.where(delay == 0.0, free, nearest(now.history, delay)[4])
 
-    def _turns(
+    def _gyro_update(
         self, now: PoseState, body: _StepMotion, gyro: Array, free: Array, tick: TimeStep
     ) -> PoseState:
         """Return the state corrected by comparing a moving robot's gyro with the contact model.
@@ -193,9 +195,9 @@ class PoseFilter(eqx.Module):
 
         The noise is that of the gyro, plus the model's process noise, whose std grows with the root
         of the path length. A reading far from the expected value has less weight, and so has every
-        reading while wheels accelerate, since the equilibrium lacks inertia. Only heading and bias
-        are updated; the model's errors enter the variance but keep their values (Schmidt 1966),
-        since the same gyro already informs the belief about floors.
+        reading while wheels accelerate, since the equilibrium neglects inertia. Only heading and
+        bias are updated; the errors of the model contribute to the variance but keep their values
+        (Schmidt 1966), since the gyro has already been used for the belief about floors.
         """
         dt, cov = jnp.maximum(tick.dt, 1e-3), now.covariance
         look = jnp.concatenate([jnp.zeros(3), body.slope[2], jnp.ones(1)])
@@ -211,11 +213,11 @@ class PoseFilter(eqx.Module):
         learns = usable * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
         return _scalar_update(now, look, gap, var, learns)
 
-    def _rest(self, now: PoseState, gyro: Array) -> PoseState:
+    def _bias_at_rest(self, now: PoseState, gyro: Array) -> PoseState:
         """Return the state with the gyro's bias updated while the robot rests.
 
-        A reading that differs much from the known bias means that the robot creeps on an edge or is
-        turned by hand, and does not change the bias.
+        A reading that differs much from the known bias does not change the bias: the robot probably
+        creeps on an edge or is turned by hand.
         """
         cov = now.covariance
         gap = gyro - now.nuisance[-1]
@@ -224,12 +226,12 @@ class PoseFilter(eqx.Module):
         look, learns = jnp.zeros(len(cov)).at[-1].set(1.0), jnp.broadcast_to(rests, len(cov))
         return _scalar_update(now, look, jnp.where(rests, gap, 0.0), var, learns.astype(float))
 
-    def _grow(self, old: PoseState, pose: Array, body: _StepMotion, tick: TimeStep) -> PoseState:
+    def _moved(self, old: PoseState, pose: Array, body: _StepMotion, tick: TimeStep) -> PoseState:
         """Return the state at the pose after the step, with the covariance propagated to it."""
         f, s, dt = self.robot, self.settings, tick.dt
         world = axes_rotation(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
-        # with a gyro, effects and process noise of the floor do not affect the yaw
+        # With a gyro, effects and process noise of the floor do not affect the yaw.
         keep = jnp.where(body.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
         far = body.speed * dt
         push = world @ (keep[:, None] * body.slope)
@@ -240,7 +242,7 @@ class PoseFilter(eqx.Module):
         floor_axes = world @ (keep[:, None] * body.axes)
         noise = (floor_axes * grown) @ floor_axes.T
         noise = noise.at[2, 2].add(jnp.where(body.by_gyro, (s.gyro_std * dt) ** 2, 0.0))
-        rows = by @ old.covariance  # rows of the pose; the others do not change
+        rows = by @ old.covariance  # only the rows of the pose; the others do not change
         pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
         rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
         return replace(
@@ -264,8 +266,8 @@ def _scalar_update(
     Args:
         now: state before the reading.
         look: derivative of the reading by pose and nuisance.
-        gap: measured less predicted reading, its unit being that of the reading.
-        var: variance of the gap, in that unit squared.
+        gap: measured less predicted reading [unit of the reading].
+        var: variance of the gap [unit of the reading, squared].
         learns: 1 for each unknown that is updated, else 0.
     """
     by = now.covariance @ look

@@ -11,11 +11,11 @@ from slipid.robot.filter.floor import SPREAD
 from slipid.robot.filter.floor_filter import BodyMotion
 from slipid.robot.interface import Readings
 
-HISTORY = 48
+HISTORY_STEPS = 48
 """Number of past steps that are kept, which limits the age of a delayed measurement."""
-TRUST = 0.25
+MAP_EXPONENT = 0.25
 """Exponent on the floors' likelihood of a pose [1]. It is below 1 because an error of the map
-affects many steps, whose evidence is therefore not independent."""
+affects many steps, so that their evidence is not independent."""
 
 
 class PoseState(eqx.Module):
@@ -28,7 +28,7 @@ class PoseState(eqx.Module):
             [rad/s].
         covariance: covariance of pose and nuisance [products of their units].
         toward: settled direction of travel, see `slipid.robot.filter.effects`.
-        still: time for which the robot has stood still [s].
+        still: time since the robot last moved [s].
         noise: covariance that process noise added to the pose over the history, in products of
             [m, m, rad].
         far: path length over the history [m].
@@ -78,10 +78,10 @@ def _corrected(
     """Return pose, nuisance, covariance, history and the factor on distances after a pose fix.
 
     The fix is of the pose `age` [s] ago. From then on, nuisance states are assumed to act on the
-    pose as they did in the last motion. The fix contains no information on process noise added
-    since then, so the covariance of that noise is subtracted from the pose's before the update and
-    added again after it. The part of it that the pose no longer contains, because a later fix
-    removed it, counts as noise of this fix.
+    pose as they did in the last motion. The fix contains no information about process noise added
+    since then, so the covariance of that noise is subtracted from that of the pose before the
+    update and added again after it. The part that the covariance of the pose no longer contains,
+    because a later fix removed it, is treated as noise of this fix.
     """
     pose, cov, history = now.pose, now.covariance, now.history
     then = nearest(history, age)
@@ -98,7 +98,7 @@ def _corrected(
     noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
     rows = look @ cov
     total = rows @ look.T + noise
-    # a fix beyond 3 stds of the expected pose has less weight, but is not rejected
+    # A fix more than 3 stds from the expected pose has less weight, but is not rejected.
     far = gap @ _inverse(total) @ gap
     total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
     gain = rows.T @ _inverse(total)
@@ -129,7 +129,7 @@ def apply_map(
     """
     share = supports / jnp.maximum(jnp.mean(supports, axis=0), 1e-12)
     weight = (share @ motion.known) / jnp.maximum(share @ motion.before, 1e-12)
-    weight = weight**TRUST
+    weight = weight**MAP_EXPONENT
     weight = weight / jnp.sum(weight)
     mean = weight @ SPREAD
     scatter = (SPREAD - mean).T @ (weight[:, None] * (SPREAD - mean))
@@ -158,9 +158,9 @@ def history_after_jump(
 
         1 - s (j . J) / |J|^2,   j the divergence per metre
 
-    of the jump J between them was already there, limited to 0 ... 1, with yaw multiplied by the
-    base radius. Past poses are shifted by that fraction of the jump. Otherwise a fix of an earlier
-    time would move the pose by the jump once more.
+    of the jump J between them (limited to 0 ... 1, with yaw multiplied by the base radius) already
+    existed a path length s [m] ago. Past poses are shifted by that fraction of the jump. Otherwise
+    a fix of an earlier time would move the pose by the jump once more.
     """
     scale = jnp.stack([jnp.ones(()), jnp.ones(()), base])
     jump, apart = scale * motion.jump, scale * motion.correction
@@ -188,8 +188,8 @@ def shifted(
 def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
     """Return the covariance of the pose given all other unknowns.
 
-    This is the most that can be subtracted from the pose's covariance alone: the rest is correlated
-    with the other unknowns, and subtracting more would leave an indefinite matrix.
+    No more than this can be subtracted from the covariance of the pose alone: the rest is
+    correlated with the other unknowns, and subtracting more would give an indefinite matrix.
     """
 
     def known(k: Int[Array, ""], c: Array) -> Array:
@@ -216,8 +216,8 @@ def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Arra
 def rebased(now: PoseState) -> PoseState:
     """Return the state with noise and path length counted from the oldest entry of the history.
 
-    They stay small however long a robot drives, and so do ages (kept instead of times), so that
-    32-bit numbers suffice.
+    Both then stay small even on long drives, and so do ages (which are stored instead of times), so
+    that 32-bit numbers suffice.
     """
     first = now.history[-1, 5:]
     history = now.history.at[:, 5:].add(-first)

@@ -13,7 +13,7 @@ class WheelState(eqx.Module):
 
     Attributes:
         speed: speed of the wheels of each drive [rad/s].
-        age: age of its last reading [s].
+        age: age of the last reading of each drive [s].
         angle: encoder angle up to which motion has been counted [rad]; NaN before the first
             reading.
     """
@@ -37,9 +37,8 @@ class MotorCurrents(eqx.Module):
     """Motor currents after one step.
 
     Attributes:
-        filtered: filtered current [A]; its magnitude where `measured` is 1.
-        measured: 0 where nothing was measured, 1 where only the magnitude was, 2 where the sign
-            was, too.
+        filtered: filtered current [A]; its magnitude if `measured` is 1.
+        measured: 0 if nothing was measured, 1 if only the magnitude, 2 if also the sign.
         variance: variance of the sensors [A^2].
     """
 
@@ -72,7 +71,7 @@ def read_wheels(
     # without an earlier angle a wheel counts as at rest
     first = known & ~jnp.isfinite(old.angle) & ~by_speed
     good = by_angle | by_speed | first
-    # readings without a valid time step do not refresh their age
+    # Readings without a valid time step do not reset the age.
     age = jnp.where(good & (dt > 0), 0.0, jnp.minimum(old.age + jnp.maximum(dt, UNTIMED_S), 1e3))
     speed = jnp.where(age > settings.stale_s, 0.0, read)
     counts = known & ((dt > 0) | ~jnp.isfinite(old.angle))
@@ -106,7 +105,7 @@ def read_currents(
     now = share * jnp.where(known, ammeter, 0.0) + (1 - share) * jnp.where(volts, by_volts, 0.0)
     read = known | volts
     a = 1 - jnp.exp(-dt / s.filter_s)
-    # a voltage shows the sign; without one an unsigned ammeter shows the magnitude alone
+    # The sign follows from a voltage; an unsigned ammeter alone shows only the magnitude.
     return MotorCurrents(
         filtered=jnp.where(read, old + a * (now - old), old),
         measured=jnp.where(read, jnp.where(volts | s.current_is_signed, 2, 1), 0),

@@ -118,7 +118,7 @@ def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
     assert done.exit_code == 1
     assert "POOR: 8 views; expected 10" in done.output
     assert np.abs(lens_from_file(out).lens.matrix[0, 0] - TRUE.fx) < 5
-    with pytest.raises(DataError, match="without a floor"):
+    with pytest.raises(DataError, match="without a place above the floor"):
         OverheadCamera.load(out)
 
 
@@ -127,7 +127,7 @@ def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
     [
         (("absent.png", *WORDS), "absent.png: No such file"),
         (("nothing.png", *WORDS), "nothing.png: the file is empty"),
-        (("words.png", *WORDS), "words.png: no picture"),
+        (("words.png", *WORDS), "words.png: not a picture"),
         (("absent*.png", *WORDS), "no file has such a name"),
         (("floor.png", "small.png", *WORDS), "small.png: 320 x 240 pixels, but .*floor.png has"),
         (("floor.png", "empty.png", *WORDS), "1 usable views"),
@@ -140,7 +140,7 @@ def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
         (("--camera", "c.json", "--points", "absent.csv"), "absent.csv: No such file"),
         (("floor.png", "--metres-per-pixel", "0.004"), "--lens-height is missing"),
         (("floor.png", "--metres-per-pixel", "-1", "--lens-height", "2"), "-1; expected a number"),
-        (("floor.png", "--turn", "9", *WORDS), "without any calibration"),
+        (("floor.png", "--turn", "9", *WORDS), "a camera without calibration"),
     ],
 )
 def test_bad_input_is_one_message(folder, camera_file, monkeypatch, words, message):

@@ -41,7 +41,7 @@ POINT = '[[points]]\nsurface = "wood"\n'
         ("[region]\nat_m = [[0, 0], [1, 1], [0.5, 0.5]]\n", r"region: \d+ cells of 8 mm that"),
         ("[[mask]]\nat_m = [[-9, -9], [9, -9], [9, 9], [-9, 9]]\n", "hide all but 0 cells"),
         ("[regions]\n", "regions: no such key, did you mean region"),
-        ("[region\n", "no valid TOML"),
+        ("[region\n", "not valid TOML"),
     ],
 )
 def test_errors_in_a_palette_are_reported(made, tmp_path, config, match):
@@ -66,7 +66,7 @@ def test_pictures_and_cameras_that_do_not_fit_are_refused(made, tmp_path):
     with pytest.raises(DataError, match=r"floor\.png: the file is empty"):
         map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     image.write_bytes(b"no picture at all")
-    with pytest.raises(DataError, match="no picture that OpenCV reads"):
+    with pytest.raises(DataError, match="not a picture that OpenCV reads"):
         map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     with pytest.raises(DataError, match="480 x 400 pixels, but the camera was calibrated at 640"):
         mapped(MadeFloor(made.picture, aslant(640), made.truth, None), tmp_path, None)
@@ -128,7 +128,7 @@ def test_the_command_without_a_config_writes_one_and_keeps_an_edited_one(tmp_pat
     assert f"--config {out / 'palette.toml'}" in text
     code, text = invoked(*common)
     assert code == 2
-    assert "it is there already and may have been edited" in text
+    assert "exists already, and proposing surfaces would overwrite it" in text
     config = (out / "palette.toml").read_text()
     (out / "palette.toml").write_text(config.replace("surface_1", "lawn"))
     code, text = invoked(*common, "--config", out / "palette.toml")

@@ -55,7 +55,7 @@ def test_a_picture_is_itself(tmp_path):
         ("none.avi", None, "No such file"),
         ("empty.avi", b"", "the file is empty"),
         ("words.avi", b"no video at all", "cannot open it"),
-        ("words.png", b"no picture", "no picture that OpenCV reads"),
+        ("words.png", b"no picture", "not a picture that OpenCV reads"),
     ],
 )
 def test_other_files_are_refused_by_their_name(tmp_path, name, data, message):

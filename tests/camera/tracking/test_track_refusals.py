@@ -63,7 +63,8 @@ def test_region_decides_between_several(made, tmp_path):
     np.testing.assert_allclose(table[["x", "y"]], OTHER.poses(3)[:, :2], atol=1e-3)
     elsewhere = refusal(made, both, *LONE, "--region", "0,0,40,40")
     assert "no marker of any dictionary" in elsewhere
-    assert "--region lies outside" in refusal(made, both, *LONE, "--id", 0, "--region=-9,-9,-1,-1")
+    outside = refusal(made, both, *LONE, "--id", 0, "--region=-9,-9,-1,-1")
+    assert "--region is outside the picture" in outside
     assert "expected four whole numbers" in refusal(made, both, *LONE, "--region", "1,2")
 
 
@@ -124,7 +125,7 @@ def test_cameras_that_do_not_fit(made, tmp_path):
     del lens["place_m"]
     (tmp_path / "camera.json").write_text(json.dumps(lens), encoding="utf-8")
     video = made.video("robot", ROBOT)
-    assert "a lens without a floor" in refusal(Made(tmp_path), video, *LONE)
+    assert "a lens without a place above" in refusal(Made(tmp_path), video, *LONE)
     (tmp_path / "camera.json").unlink()
     assert "No such file" in refusal(Made(tmp_path), video, *LONE)
 

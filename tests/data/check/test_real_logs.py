@@ -47,4 +47,4 @@ def test_currents_of_the_supply_are_distinguished_from_those_of_torque(real_data
     found = findings(runs, two_sides(0.30, 1.08))
     (note,) = (f for f in found if f.kind == "current_of_supply")
     # some are below zero, so they cannot be read as magnitudes
-    assert "take the current out of the layout" in (note.remedy or "")
+    assert "remove the current from the layout" in (note.remedy or "")

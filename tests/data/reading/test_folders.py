@@ -55,7 +55,7 @@ def test_runs_are_added_with_the_sessions_they_had(root):
     assert [log.load for log in both.logs] == ["as_built", "moved"]
     assert both.session == (ROBOTINO, "gray/moved/0.10")
     np.testing.assert_array_equal(both.pose[both.rows(0)], as_built.pose)
-    with pytest.raises(DataError, match=rf"{ROBOTINO}: in both sets of runs; expected it once"):
+    with pytest.raises(DataError, match=rf"{ROBOTINO}: in both sets of runs; expected every run"):
         both + as_built
 
 

@@ -10,7 +10,7 @@ from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import read_logs, read_runs
 from slipid.data.reading.signal import Signal, SignalSource, heading
 from slipid.data.wheel_signals import readings, refresh_period
-from slipid.data.windows import UNREAD, windows
+from slipid.data.windows import UNREAD_VARIANCE, windows
 from slipid.support.errors import DataError
 
 RADIUS = 0.1
@@ -177,7 +177,7 @@ def test_files_beside_each_other_are_one_run(tmp_path, epoch, quaternion):
 def test_a_file_that_should_lie_beside_is_named_with_what_does(tmp_path):
     beside(tmp_path / "run1")
     (tmp_path / "run1" / "mocap.csv").rename(tmp_path / "run1" / "camera.csv")
-    with pytest.raises(DataError, match=r"mocap.csv: not there.*there is camera.csv"):
+    with pytest.raises(DataError, match=r"mocap.csv: missing.*which has camera.csv"):
         one(tmp_path, layout_beside(), "*/joint_states.csv")
 
 
@@ -186,7 +186,7 @@ def test_clocks_that_do_not_overlap_are_refused(tmp_path):
     beside(tmp_path / "run2", 1_721_300_000.0)
     (tmp_path / "run2" / "mocap.csv").replace(tmp_path / "run1" / "mocap.csv")
     with pytest.raises(
-        DataError, match=r"no pose while the wheels were measured.*clocks that agree"
+        DataError, match=r"no pose while the wheels were measured.*times of both counted"
     ):
         one(tmp_path, layout_beside(), "run1/joint_states.csv")
 
@@ -194,7 +194,7 @@ def test_clocks_that_do_not_overlap_are_refused(tmp_path):
 def test_a_channel_in_two_files_is_refused():
     layout = layout_beside()
     layout["beside"]["mocap.csv"]["columns"]["wheel_angle"] = WHEELS
-    with pytest.raises(DataError, match="channel 'wheel_angle' in two files"):
+    with pytest.raises(DataError, match="channel 'wheel_angle' is in two files"):
         declared_layout(layout, "test")
 
 
@@ -263,12 +263,12 @@ def test_a_slow_ammeter_counts_once_a_reading(tmp_path):
         csv(tmp_path / f"run{k:02d}.csv", names, rows.tolist())
     data = one(tmp_path, {"columns": columns})
     assert data.current_fresh.sum(axis=0) == pytest.approx([72, 72], abs=2)
-    assert "current is read anew every 1 s" in " ".join(data.logs[0].notes)
+    assert "current is refreshed every 1 s" in " ".join(data.logs[0].notes)
     w = windows(data, RADIUS, per_segment=2, longest=3.0)
-    read = w.current_var < UNREAD
+    read = w.current_var < UNREAD_VARIANCE
     assert np.median(w.current_var[read]) == pytest.approx(0.01 / 2.5, rel=0.5)
     short = windows(data, RADIUS, longest=0.25)
-    assert (short.current_var == UNREAD).mean() == pytest.approx(0.75, abs=0.1)
+    assert (short.current_var == UNREAD_VARIANCE).mean() == pytest.approx(0.75, abs=0.1)
 
 
 # poses that jump ------------------------------------------------------------------------------

@@ -125,13 +125,16 @@ def test_a_config_starts_from_a_preset_and_overrides_it(root):
         ({"format": "robotino2022", "names_row": True}, "names_row: True; .*valid integer"),
         ({"format": "robotino2022", "delimiter": ";;"}, "delimiter: ';;'; .*at most 1 char"),
         ({"format": "robotino2022", "new_run": "often"}, "new_run: 'often'; .*time_restarts"),
-        ({"format": "robotino2022", "first_data_row": 2}, "expected it below names and units"),
+        (
+            {"format": "robotino2022", "first_data_row": 2},
+            "expected a row below those of names",
+        ),
         (
             {"format": "robotino2022", "metres_per_pixel": [1, -1]},
             "metres_per_pixel.2.: -1; .*greater than 0",
         ),
         ({"format": "robotino2022", "columns": {"time": False}}, "no time column"),
-        ({"format": "robotino2022", "columns": {"pose_x": False}}, "a pose in parts"),
+        ({"format": "robotino2022", "columns": {"pose_x": False}}, "an incomplete pose"),
         ({"format": "robotino2022", "columns": ["t"]}, "expected a table"),
         ({"format": "robotino2022", "columns": {"gyro": "g"}}, "columns.gyro: 'g'; expected"),
         (
@@ -169,7 +172,7 @@ def test_a_config_starts_from_a_preset_and_overrides_it(root):
             {k: v for k, v in GENERIC_LAYOUT.items() if k != "ticks_per_revolution"},
             "wheel_ticks without ticks_per_revolution",
         ),
-        ({**GENERIC_LAYOUT, "names_row": 0}, "columns by name, but names_row is 0"),
+        ({**GENERIC_LAYOUT, "names_row": 0}, "columns are given by name, but names_row is 0"),
         (
             {
                 **GENERIC_LAYOUT,
@@ -268,7 +271,7 @@ def test_empty_cells_leave_a_pose_stale_and_are_noted(root):
         lines[row] = ",".join(cells)
     path.write_text("\n".join(lines))
     log = generic(root)
-    assert log.notes == ("column 'x' has empty cells: it counts at its own times",)
+    assert log.notes == ("column 'x' has empty cells: it is used at the times of its values",)
     there = np.delete(np.arange(len(good.pose)), [49, 50])
     np.testing.assert_allclose(log.pose[there], good.pose[there], atol=1e-12)
     np.testing.assert_array_equal(log.pose[49:51], good.pose[[48, 48]])
@@ -289,7 +292,7 @@ def test_counters_that_wrap_around_are_continued(root, bits):
     path.write_text("\n".join(lines))
     log = generic(root, tick_bits=bits)
     np.testing.assert_allclose(log.wheel_angle, good.wheel_angle, atol=1e-9)
-    assert log.notes == (f"tick counter wrapped around at {bits} bits and was continued",)
+    assert log.notes == (f"the wrap-around of the tick counter at {bits} bits was removed",)
 
 
 def test_increments_and_signs(tmp_path):

@@ -75,7 +75,7 @@ def test_inductance_needs_rows_in_its_time_constant():
     assert e.value == pytest.approx(8.9e-3, rel=0.03)
     slow = fitted(made.logged(made.driven(made.FLYWHEEL), 50))
     assert slow.parameters["motor.inductance"].verdict == "not_identified"
-    assert any("not identified at this rate" in text for text in slow.messages)
+    assert any("not identified at this sampling rate" in text for text in slow.messages)
 
 
 @pytest.mark.slow
@@ -145,7 +145,7 @@ def test_a_reversed_motor_has_the_same_numbers(record):
 
 def test_time_does_not_run_backwards(record):
     back = {k: getattr(record, k)[::-1] for k in ("voltage", "current", "speed")}
-    with pytest.raises(DataError, match="speeds up against its current"):
+    with pytest.raises(DataError, match="accelerates against its current"):
         fitted(replace(record, **back))
 
 
@@ -200,7 +200,7 @@ def test_at_one_speed_nothing_is_identified(record):
     )
     found = fitted(still)
     assert {e.verdict for e in found.parameters.values()} == {"not_identified"}
-    assert any("keep to one value" in text for text in found.messages)
+    assert any("speed and voltage are constant" in text for text in found.messages)
 
 
 @pytest.mark.slow
@@ -210,7 +210,7 @@ def test_a_misfit_is_named_and_lowers_verdicts(record):
     found = fitted(replace(record, current=record.current + odd))
     assert misfits(found.fits[0])
     assert not found.good
-    assert any("the model lacks" in text for text in found.messages)
+    assert any("the model does not include" in text for text in found.messages)
     assert found.parameters["motor.coulomb_friction"].verdict != "identified"
 
 
@@ -227,7 +227,7 @@ def test_a_fixed_number_stays(record):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: {"current": 1000 * r.current}, "amperes"),
+        (lambda r: {"current": 1000 * r.current}, "unit of the current"),
         (lambda r: {"current": r.voltage, "voltage": r.current}, "exchanged"),
         (lambda r: {"current": -r.current}, "current has the wrong sign"),
         (lambda r: {"speed": -r.speed}, "speed has the wrong sign"),

@@ -239,7 +239,9 @@ def test_scrub_needs_turning():
     driven = begin.plus(this.rows(straight))
     assert len(straight) == 12
     assert scrub.std(driven) == pytest.approx(scrub.std(begin), rel=1e-6)
-    assert scrub.std(driven.plus(this.rows(straight), info.ENDLESS)) > 0.99 * scrub.std(begin)
+    assert scrub.std(driven.plus(this.rows(straight), info.UNLIMITED_REPEATS)) > 0.99 * scrub.std(
+        begin
+    )
     chosen, found = info.greedy(driven, this.rows(offered), scrub.rows, 4)
     assert all(offered[k].turn for k in chosen)
     assert found[-1] < 0.25 * found[0]

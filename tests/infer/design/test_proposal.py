@@ -109,7 +109,7 @@ def test_without_goals_it_predicts_every_floor(folder):
     assert "prediction of every floor" in done.stdout
     assert "chosen runs are worth the 2021 paper's grid (36 runs)" in done.stdout
     if "deg/s" in done.stdout:
-        assert "soft was never driven turning" in done.stdout
+        assert "no fitted run turns on soft" in done.stdout
 
 
 def test_limits_of_the_candidates_hold(folder):
@@ -126,7 +126,7 @@ def test_limits_of_the_candidates_hold(folder):
 def test_an_unreachable_goal_exits_with_1_and_names_the_channel(folder):
     done = design(folder, "--parameter", "motor.resistance")
     assert done.exit_code == 1
-    assert "no candidate run shrinks motor.resistance" in done.stdout
+    assert "no candidate run reduces the std of motor.resistance" in done.stdout
     assert "log the motor voltage (or duty and bus voltage)" in done.stdout
     found = json.loads((folder / "design.json").read_text(encoding="utf-8"))
     assert found["runs"] == []
@@ -142,10 +142,10 @@ def test_an_unreachable_goal_exits_with_1_and_names_the_channel(folder):
         (("--predict", "blue:0.1"), "no floor 'blue'; identified: soft"),
         (("--predict", "soft@heavy"), "no load set-up 'heavy'; identified: as_built"),
         (("--floor", "blue"), "no floor 'blue'"),
-        (("--speeds", "-0.1"), "numbers not below 0"),
-        (("--headings", "north"), "expected numbers with commas between"),
-        (("--distance", "0"), "expected metres above zero"),
-        (("--speeds", "0", "--turns", "0"), "no candidate run is left"),
+        (("--speeds", "-0.1"), "numbers of at least 0"),
+        (("--headings", "north"), "expected numbers separated by commas"),
+        (("--distance", "0"), "expected a positive length in metres"),
+        (("--speeds", "0", "--turns", "0"), "no candidate run remains"),
     ],
 )
 def test_bad_options_exit_with_2_and_list_the_choices(folder, words, message):

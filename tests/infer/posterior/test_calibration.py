@@ -85,7 +85,7 @@ def test_electric_draws_that_never_moved_prevent_convergence(whole, monkeypatch)
     monkeypatch.setattr(posterior, "electric_given_motion", half_still)
     found = posterior.sampled(fit, plan, 10, blocks, QUIET)
     assert not found.converged
-    assert found.reason == "50.0 % of the electric draws, which never moved"
+    assert found.reason == "50.0 % of the electric draws, which had no accepted proposal"
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from slipid.infer.verdicts import unidentified as flat_module
 from slipid.infer.verdicts import wording
 from slipid.infer.verdicts.estimates import RATIOS, derived, estimates
 from slipid.infer.verdicts.profile import RISE, _Refits, profile, profiled
-from slipid.infer.verdicts.unidentified import NOTICED, flat_directions, sentences
+from slipid.infer.verdicts.unidentified import FLAT_INFORMATION, flat_directions, sentences
 from slipid.infer.verdicts.wording import VOLTAGE, remedy
 from slipid.model.robot import Validity
 from slipid.search_space import Choice, Space
@@ -72,7 +72,7 @@ def test_what_is_called_flat_is_and_nothing_is_left_out(seed):
     assert found
     pivots = []
     for picked, u in found:
-        assert u @ p[np.ix_(picked, picked)] @ u < NOTICED
+        assert u @ p[np.ix_(picked, picked)] @ u < FLAT_INFORMATION
         for k in range(len(picked)):  # without any of its numbers nothing flat remains
             fewer = picked[:k] + picked[k + 1 :]
             if fewer and len(picked) > 1:
@@ -80,7 +80,7 @@ def test_what_is_called_flat_is_and_nothing_is_left_out(seed):
                 assert lowest >= flat_module._NO_EFFECT
         pivots.append(picked[int(np.argmax(np.abs(u) > 0.9 * np.abs(u).max()))])
     rest = [k for k in range(8) if k not in pivots]
-    assert np.linalg.eigvalsh(p[np.ix_(rest, rest)])[0] >= NOTICED
+    assert np.linalg.eigvalsh(p[np.ix_(rest, rest)])[0] >= FLAT_INFORMATION
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -103,7 +103,7 @@ def test_powers_differ_by_formula():
     three = [*both, *wording.axes_of(numbers("surface.soft.creep")[0])]
     open_ = wording._product(three, np.array([1.0, -0.5, 0.8]))
     assert open_.startswith(
-        f"no effect on the data for any factor t: {a} times t, {b} divided by t^0.5, "
+        f"changes without effect on the data, for any factor t: {a} times t, {b} divided by t^0.5, "
     )
     assert open_.endswith(" times t^0.8")
     assert wording._sum([a, b], np.array([1.0, -1.0])) == f"{a} and {b} only as {b} + {a}"
@@ -373,7 +373,7 @@ def test_a_profile_without_a_lower_end_ends_at_the_bound():
     assert p.ends == ("at_bound", "closed")
     assert p.interval90[0] == 0.0
     assert p.interval90[1] < p.value[-1]
-    assert "is at its bound: the data only put it below" in p.sentence
+    assert "is at its bound: the data only show that it is below" in p.sentence
 
 
 @pytest.mark.slow
@@ -422,4 +422,4 @@ def test_a_profile_of_a_number_without_data_is_level():
 def test_a_profile_of_something_else_is_refused_with_the_choices(path, why):
     with pytest.raises(ValueError, match=why) as error:
         profiled(space_of("motor.resistance", "robot.load_share@*"), path)
-    assert str(error.value).endswith("a profile is of one free number: motor.resistance")
+    assert str(error.value).endswith("expected one free number: motor.resistance")

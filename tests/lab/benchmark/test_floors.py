@@ -20,9 +20,9 @@ from slipid.lab.benchmark.floors.fitting import (
 )
 from slipid.lab.benchmark.floors.husky import (
     COLUMNS,
-    FREE_A,
-    FREE_AS,
-    ZERO_A,
+    NO_LOAD_A,
+    NO_LOAD_SLOPE,
+    REST_READING_A,
     HuskyFloorTask,
     husky,
     husky_classifiers,
@@ -378,7 +378,7 @@ def driven(robot, runs: int = 4, noise: float = 0.5, seed: int = 0):
             pairs[0] = pairs[4] = 2.0
             speed = np.repeat(pairs, 13, axis=0)
             amps, turn = shown(robot, jnp.asarray(k), jnp.asarray(speed))
-            current = np.asarray(amps) + ZERO_A + noise * rng.normal(size=speed.shape)
+            current = np.asarray(amps) + REST_READING_A + noise * rng.normal(size=speed.shape)
             gyro = np.asarray(turn) + 0.02 * rng.normal(size=len(speed))
             run = made_floor_run(floor, speed, 0.0, name=f"{floor}/{seed}{n}")
             made.append(replace(run, current=np.abs(current), gyro=gyro))
@@ -393,7 +393,8 @@ def slippery():
 @pytest.mark.slow
 def test_frictions_are_found_by_currents_and_turning(slippery):
     runs = [
-        replace(f, current=np.maximum(f.current - ZERO_A, 0)) for f in driven(slippery, noise=0.1)
+        replace(f, current=np.maximum(f.current - REST_READING_A, 0))
+        for f in driven(slippery, noise=0.1)
     ]
     start = ground({"grass": 0.4, "ice": 0.4, "snow": 0.4})
     found = fitted_floors(start, runs).surfaces.friction
@@ -406,7 +407,9 @@ def test_frictions_are_found_by_currents_and_turning(slippery):
 
 @pytest.mark.slow
 def test_slipid_classifies_floors_that_differ_in_friction_only_without_later_signals(slippery):
-    method = SlipidFloorClassifier(robot=husky(), zero_a=ZERO_A).fit(driven(slippery), HUSKY)
+    method = SlipidFloorClassifier(robot=husky(), zero_a=REST_READING_A).fit(
+        driven(slippery), HUSKY
+    )
     assert method.labels == ("grass", "ice", "snow")
     assert np.asarray(method.fitted.motor.stiffness) == pytest.approx([-0.5, 0.5], abs=0.2)
     judged = driven(slippery, runs=3, seed=1)
@@ -461,7 +464,8 @@ def test_a_classifier_that_fails_has_an_empty_row_beside_the_others():
 
 
 def in_the_air(root: Path) -> tuple[float, float, float]:
-    """Return `ZERO_A`, `FREE_A` and `FREE_AS` by runs of a Husky with its wheels in the air.
+    """Return `REST_READING_A`, `NO_LOAD_A` and `NO_LOAD_SLOPE` by runs of a Husky with its wheels
+    in the air.
 
     Rows count in which a wheel keeps its speed.
     """
@@ -486,7 +490,7 @@ def test_a_free_wheel_draws_what_was_measured(real_data):
     folder = real_data / "drive_skid" / "husky_in_the_air"
     if not folder.is_dir():
         pytest.skip(f"no logs of wheels in the air: {folder} is no folder")
-    assert in_the_air(folder) == pytest.approx((ZERO_A, FREE_A, FREE_AS), rel=0.05)
+    assert in_the_air(folder) == pytest.approx((REST_READING_A, NO_LOAD_A, NO_LOAD_SLOPE), rel=0.05)
 
 
 def test_a_robotino_run_enters_without_its_pose():
@@ -549,7 +553,7 @@ def test_a_table_that_fails_is_kept_with_its_reason_until_the_logs_change(tmp_pa
     assert part.run() == "husky_floors"
     assert "no file FLOOR/RUN.csv" in part.table()["failed"]
     written(tmp_path / "borealtc" / "ICE" / "00.csv", ["0,1,1,1,1,0,0"])
-    assert part.table() == {"failed": "it was not kept"}
+    assert part.table() == {"failed": "the result was not saved"}
     part.run()
     assert "1 rows" in part.table()["failed"]
 

@@ -85,8 +85,8 @@ def test_a_data_set_in_which_nothing_ran_has_no_picture():
 def test_fits_that_did_not_converge_are_reported():
     content = copy.deepcopy(CONTENT)
     content["sets"]["carpets"]["protocols"]["known_floor"]["slipid"]["unconverged"] = 2
-    assert "slipid: fits did not come to rest: 2" in text(content)
-    assert "slipid: fits did not come to rest: 2" in page(content, {})
+    assert "slipid: fits that did not converge: 2" in text(content)
+    assert "slipid: fits that did not converge: 2" in page(content, {})
 
 
 def classifier_row(name, absent=""):

@@ -10,7 +10,7 @@ from slipid.lab.benchmark.tuning import _loss, tuned
 from slipid.lab.systems.motion.quann import QuannEnergy
 from slipid.predict.folds import FoldKey
 from slipid.predict.slip_model import PredictedRun, RobotSpec, SlipModel, path_of
-from slipid.predict.slip_models import FEWEST, ByFloor
+from slipid.predict.slip_models import LEAST_RUNS, ByFloor
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
@@ -233,13 +233,13 @@ def test_a_method_by_floor_has_one_fit_for_all_unknown_floors():
 
 
 def test_a_floor_of_few_runs_has_the_fit_to_all():
-    few = runs(slip=0.5)[: 18 + FEWEST - 1]
+    few = runs(slip=0.5)[: 18 + LEAST_RUNS - 1]
     done = ByFloor.of(Mean()).fit(few, ROBOTINO)
     assert list(done.fitted) == ["gray", "green"]
     everything = Mean().fit(few, ROBOTINO)
     assert done.fitted["green"] == everything
     assert done.fitted["gray"] == Mean().fit(few[:18], ROBOTINO)
-    enough = ByFloor.of(Mean()).fit(runs(slip=0.5)[: 18 + FEWEST], ROBOTINO)
+    enough = ByFloor.of(Mean()).fit(runs(slip=0.5)[: 18 + LEAST_RUNS], ROBOTINO)
     assert enough.fitted["green"] != everything
 
 

@@ -241,16 +241,18 @@ def ends(value, low=None, high=None, behind=None):
 def test_the_reading_names_the_rows_that_are_ahead():
     ahead = {"slipid": ends(0.1), "rival": ends(0.05, behind=MeanInterval(-0.05, -0.07, -0.03))}
     assert sentence("carpet", "new_floor", ahead) == (
-        "carpet, new floor: rival is ahead of slipid: 5.0 % against 10.0 %, "
+        "carpet, new floor: rival is better than slipid: 5.0 % against 10.0 %, "
         "-5.0 points [-7.0, -3.0]"
     )
     both = {**ahead, "third": ends(0.06, behind=MeanInterval(-0.04, -0.06, -0.02))}
-    assert "new floor: rival (and 1 more) is ahead of slipid:" in sentence("x", "new_floor", both)
+    assert "new floor: rival (and 1 more) is better than slipid:" in sentence(
+        "x", "new_floor", both
+    )
     tied = {"slipid": ends(0.1), "rival": ends(0.09, behind=MeanInterval(-0.01, -0.03, 0.01))}
-    assert sentence("x", "sectors", tied).endswith("by 9.0 %; not told apart from rival")
+    assert sentence("x", "sectors", tied).endswith(" 9.0 %; no significant difference to rival")
     many = {f"row{k}": ends(0.1 + 0.01 * k, behind=MeanInterval(0.0, -0.1, 0.1)) for k in range(6)}
     assert sentence("x", "sectors", {"slipid": ends(0.1), **many}).endswith(
-        "not told apart from row0, row1, row2, row3 and 2 more"
+        "no significant difference to row0, row1, row2, row3 and 2 more"
     )
     behind = {"slipid": ends(0.1), "rival": ends(0.2, behind=MeanInterval(0.1, 0.08, 0.12))}
-    assert sentence("x", "sectors", behind).endswith("by 20.0 %, +10.0 points [+8.0, +12.0]")
+    assert sentence("x", "sectors", behind).endswith(" 20.0 %, +10.0 points [+8.0, +12.0]")

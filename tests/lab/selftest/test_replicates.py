@@ -240,10 +240,10 @@ def test_a_plan_with_voltage_recovers_the_motor(tested):
 def test_replicates_that_are_done_are_not_repeated(tested):
     out, stopped, left, again = tested
     assert stopped.exit_code == 130
-    assert "the next call goes on from what was kept" in stopped.stderr
+    assert "the same command continues from the last checkpoint" in stopped.stderr
     assert list(left) == ["replicates.json"]
     before = json.loads(left["replicates.json"])["content"]
-    assert "1 of 2 replicates are in" in again.stderr
+    assert "1 of 2 replicates are already in" in again.stderr
     after = json.loads((out / "replicates.json").read_text())["content"]
     assert (len(before), len(after)) == (1, 2)
     assert after[0] == before[0]

@@ -272,7 +272,7 @@ def test_what_is_added_to_the_engine_only_takes_energy():
     twists = [[0.0, 0.0, 0.5], [0.2, 0.0, 0.0], *rng.uniform(-0.3, 0.3, (20, 3))]
     for vx, vy, turn in twists:
         plant.data.qvel[:6] = [vx, vy, 0.0, 0.0, 0.0, turn]
-        plant._resist()
+        plant._apply_resistance()
         force = plant.data.qfrc_applied[:6]
         assert force @ plant.data.qvel[:6] < 0
         if vx == vy == 0:
@@ -410,8 +410,8 @@ def test_the_same_seed_drives_the_same_run():
     ("make", "match"),
     [
         (lambda: RobotBuild(rollers=7), r"rollers\s+Input should be a multiple of 2"),
-        (lambda: RobotBuild(roller_radius_m=0.05), "rollers as large as the wheel"),
-        (lambda: RobotBuild(mass_kg=1.0), "less than the wheels weigh"),
+        (lambda: RobotBuild(roller_radius_m=0.05), "rollers are as large as the wheel"),
+        (lambda: RobotBuild(mass_kg=1.0), "less than the mass of the wheels"),
         (lambda: RobotBuild(centres_m={"far": (0.2, 0.0)}), "load far: the centre of mass"),
         (
             lambda: RobotBuild(wheel_azimuths_deg=(0.0, 90.0)),

@@ -159,5 +159,5 @@ def test_the_published_layout_comes_back(trace, tmp_path):
     four = np.zeros((log.samples, 4))
     each = ("wheel_angle", "wheel_speed", "wheel_speed_command", "current", "voltage")
     other = replace(log, **dict.fromkeys(each, four))
-    with pytest.raises(ValueError, match="the 2022 layout has three"):
+    with pytest.raises(ValueError, match="expected three for the 2022 layout"):
         robotino2022_csv(other, 16.0, 2000)

@@ -156,7 +156,7 @@ def test_another_config_does_not_mix_with_what_is_there(config, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "simulate.json").write_text('{"config_hash": "other"}')
-    with pytest.raises(DataError, match="holds runs of another config"):
+    with pytest.raises(DataError, match="contains runs with another config"):
         quietly(config, out)
 
 
@@ -210,11 +210,17 @@ def test_the_configs_that_ship_are_good(path):
             ("[maps]", '[maps]\nsoft = { kind = "patchwork", surfaces = ["firm"] }'),
             "maps.soft: also the name of a surface",
         ),
-        (("friction = 0.7", 'colour = "#8f9194"'), "maps.zones: two surfaces have one colour"),
-        (("gyro = true", "current_is_signed = true"), "formats: robotino2022 is for three wheels"),
+        (("friction = 0.7", 'colour = "#8f9194"'), "maps.zones: two surfaces have the same colour"),
+        (
+            ("gyro = true", "current_is_signed = true"),
+            "formats: robotino2022 is only for three wheels",
+        ),
         (("[maps]", '[robot]\ncentres_m = { "../x" = [0, 0] }\n[maps]'), "load '../x'"),
         (("[maps]", "[robot]\ncentres_m = { as_built = [nan, 0] }\n[maps]"), "centre of mass"),
-        (("[maps]", "[robot]\nwheel_azimuths_deg = [60, 60, 60]\n[maps]"), "expected them spread"),
+        (
+            ("[maps]", "[robot]\nwheel_azimuths_deg = [60, 60, 60]\n[maps]"),
+            "expected angles all around",
+        ),
         (("step_deg = 180", "step_deg = 1e-9"), "step_deg: 1e-09"),
         (("distance_m = 0.1", "distance_m = inf"), "distance_m: inf"),
         (

@@ -17,7 +17,7 @@ from slipid.lab.trial.goswami_padhy import (
     tracking_error,
 )
 
-PROMPT = {"shares": np.array([[1.0, 0.0]]), "follow": 1.0, "period": 0.05}
+PROMPT = {"delay_weights": np.array([[1.0, 0.0]]), "lag_gain": 1.0, "period": 0.05}
 """Wheels that do at once what they are asked to."""
 
 

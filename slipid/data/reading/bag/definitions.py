@@ -1,6 +1,6 @@
 """Definitions of message types: the numbers and texts in a message of each type.
 
-They come from the bag, else from .msg files, else from the standard types of ROS.
+They are taken from the bag, else from .msg files, else from the standard types of ROS.
 """
 
 from collections.abc import Iterator
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import rosbags.interfaces.typing
 
 FieldType = Union[str, "ArrayType", "MessageType"]
-"""Type of a field: a number, by its numpy type without byte order (`f8`); `TEXT`; an array; or
-another message."""
+"""Type of a field: the numpy type of a number without byte order (such as `f8`), `TEXT`, an array,
+or another message."""
 TEXT = "text"
 """Type of a text in UTF-8."""
 _DTYPES = {
@@ -94,7 +94,7 @@ def definition_of(
         return _message(name, _parsed(name, carried), folder)
     except NoDefinition as error:
         missing = error.args[0]
-        also = "" if missing == name else f", which {name} is made of"
+        also = "" if missing == name else f", which {name} contains"
         nor = f"{folder} has no {missing.rsplit('/', 1)[-1]}.msg; " if folder else ""
         raise DataError(
             f"{where}: no definition of {missing}{also} in the bag; {nor}expected one: name a "

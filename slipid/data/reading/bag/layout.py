@@ -23,7 +23,7 @@ from slipid.support.errors import DataError
 from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
 
 EFFORT = '"A" (current), "N*m" (motor_torque or wheel_torque), "V" (voltage) or "1" (duty)'
-"""Text, for error messages, about the units that drivers use for the effort of a JointState."""
+"""Units in which drivers publish the effort of a JointState, as text for error messages."""
 
 
 Texts = Annotated[tuple[StrictStr, ...], BeforeValidator(several)]
@@ -31,18 +31,21 @@ Texts = Annotated[tuple[StrictStr, ...], BeforeValidator(several)]
 
 @dataclass(frozen=True, config=CLOSED)
 class TopicChannel:
-    """Position of one channel in a bag: value = (scale x number + offset), in `unit`.
+    """Topic and fields of one channel in a bag: value = (scale x number + offset), in `unit`.
 
     Attributes:
-        topics: the topic; several where each holds some of the wheels.
-        fields: paths of the numbers in a message, such as `motors[0].current`; an array without an
-            index counts with all its elements. For a pose or a twist the field that holds it. Known
-            message types need none.
-        unit: unit of the numbers; known message types need none, except for the effort of joints.
-        scale: a sign or a correction, one number for all columns or one for each.
-        offset: added after the scale, in `unit`.
-        frame: frame in which a pose is expressed, if it is looked up in transforms (`/tf`).
-        child: frame whose pose is looked up.
+        topics: name of the topic, or a list of topics if the wheels are spread over several topics.
+        fields: path of each number in a message, such as `motors[0].current`; an array without an
+            index stands for all its elements. For a pose or a twist, the path of the field that
+            contains it. Not needed for the message types that slipid knows.
+        unit: unit of the numbers; not needed for the message types that slipid knows, except for
+            the effort of joints.
+        scale: factor on the numbers, such as -1 for a reversed sign: one number for all wheels, or
+            one per wheel.
+        offset: number that is added after scaling, in `unit`.
+        frame: frame in which the pose is expressed, such as `map`, if the pose is taken from
+            transforms (`/tf`).
+        child: frame whose pose is taken from transforms, such as `base_link`.
     """
 
     topics: Annotated[Texts, Field(min_length=1, validation_alias=AliasChoices("topics", "topic"))]
@@ -57,24 +60,27 @@ class TopicChannel:
         for path in self.fields:
             check_path(path)
         if (self.frame is None) != (self.child is None):
-            raise ValueError("one frame only; expected both frame and child, or none of them")
+            raise ValueError("only one of frame and child is given; expected both, or none of them")
         if len(self.fields) > 1 and len(self.topics) > 1:
             raise ValueError("several topics and several fields; expected one field for all topics")
 
 
 @dataclass(frozen=True, config=CLOSED)
 class RunRule:
-    """Rule that separates the runs of a bag: a topic, pauses or a table.
+    """Rule that separates the runs of a bag: by a topic, by pauses or by a table.
 
     Attributes:
-        topic: topic whose value marks a run: true, or one value while it stays.
-        field: path of that value.
-        between: values between runs.
-        surface, load: path of the field that names the floor, or the load set-up.
-        pause_s: time without motion of any wheel after which a new run starts [s].
-        table: CSV file with columns start and end [s], perhaps surface, load, name and bag,
-            relative to the folder of the bag.
-        from_start: whether its times count from the first sample of the bag; else as stamps do.
+        topic: topic whose value tells runs apart: a run lasts as long as the value stays the same
+            and is not one of `between`.
+        field: path of this value in a message of the topic.
+        between: values of the topic while no run is being driven.
+        surface: path of the field with the name of the floor.
+        load: path of the field with the name of the load set-up.
+        pause_s: a new run starts after all wheels have stood still for this time [s].
+        table: CSV file with one run per row, relative to the folder of the bag. Its columns are
+            start and end [s], and optionally surface, load, name and bag.
+        from_start: true if the times of the table are counted from the first sample of the bag; by
+            default they are times as in the messages.
     """
 
     topic: StrictStr | None = None
@@ -99,14 +105,15 @@ class BagLayout(SensorLayout):
     """Layout of the bags of one robot.
 
     Attributes:
-        topics: position of each channel, or group of channels.
-        joints: names of the drives' joints, in the order of the drives.
-        runs: rule that separates runs; without it a bag is one run.
-        stamp: time that counts: the one in the messages (where they have one), or the one at which
-            the recorder received them.
-        max_disorder: largest delay of messages of a topic that are sorted [s].
-        drop_nan: whether messages with NaN are left out; else they are refused.
-        definitions: folder of .msg files, for message types whose definition the bag lacks.
+        topics: topic and fields of each channel or group of channels.
+        joints: names of the joints of the wheels or motors, in the order of the drives.
+        runs: rule that separates the runs of a bag; by default a bag is one run.
+        stamp: "header" to use the time stamps in the headers of messages (if they have one),
+            "received" to use the times at which the recorder received the messages.
+        max_disorder: messages of a topic may be out of order by up to this time [s]; they are then
+            sorted.
+        drop_nan: true to leave out messages with NaN; by default they are an error.
+        definitions: folder with the .msg files of message types whose definition is not in the bag.
     """
 
     topics: dict[str, TopicChannel]
@@ -119,7 +126,7 @@ class BagLayout(SensorLayout):
 
     @property
     def holds(self) -> frozenset[str]:
-        """Return every channel of a run."""
+        """Names of all channels of a run."""
         return frozenset(inner for name in self.topics for inner in GROUPS.get(name, (name,)))
 
 
@@ -132,12 +139,12 @@ def declared_bag_layout(
     """Return the layout of bags in a config: a table with `kind = "bag"`.
 
     Args:
-        table: content of the section.
+        table: content of the config section.
         where: name of the section in messages, such as `robot.toml [layouts.mine]`.
         folder: folder to which a relative `definitions` refers.
 
     Raises:
-        DataError: unknown key, channel or unit, wrong dimension, wrong type.
+        DataError: a key, channel or unit is unknown, or a value has the wrong dimension or type.
     """
     given = {key: value for key, value in table.items() if key != "kind"}
     layout = checked(where, given, BagLayout)
@@ -152,21 +159,24 @@ def declared_bag_layout(
 
 
 def _channel_problem(name: str, channel: TopicChannel) -> str | None:
-    """Return a text about a contradiction in the position of one channel, or None."""
+    """Return a text about a contradiction in the settings of one channel, or None."""
     if name not in _NAMES:
         return unknown("channel", name, _NAMES)
     if channel.frame is not None and name != "pose":
-        return "frame and child, which belong to a pose; expected neither"
+        return "frame and child are for poses only; expected neither"
     if name in GROUPS:
         plain = channel.unit is None and channel.scale == (1.0,) and channel.offset == 0.0
         if plain and len(channel.topics) == 1 and len(channel.fields) <= 1:
             return None
         inner = ", ".join(GROUPS[name])
-        return f"more than topic and field; expected these alone, or {inner} each with its own"
+        return (
+            "keys other than topic and field; expected these two alone, or separate entries for "
+            f"{inner}"
+        )
     if name not in PER_WHEEL and len(channel.topics) > 1:
         return f"{len(channel.topics)} topics; expected one"
     if channel.unit is None and any(path.endswith("effort") for path in channel.fields):
-        return f"effort without a unit, and drivers disagree on it; expected unit = {EFFORT}"
+        return f"effort without a unit, which differs between drivers; expected unit = {EFFORT}"
     if channel.unit is not None:
         try:
             factor(channel.unit, CHANNELS[name])
@@ -180,15 +190,15 @@ def _problem(layout: BagLayout) -> str | None:
     have = set(layout.topics)
     for group, inner in GROUPS.items():
         if group in have and (twice := have & set(inner)):
-            return f"{group} and {min(twice)}; expected one of them"
+            return f"both {group} and {min(twice)} are given; expected only one of them"
     if not have:
-        return "topics: no channel; expected a table of channels"
+        return "topics: empty; expected a table of channels"
     if lacking := layout.lacks(layout.holds):
         return lacking
     if len(set(layout.joints)) < len(layout.joints):
-        return f"joints {list(layout.joints)}; expected each once"
+        return f"joints {list(layout.joints)}; expected each name only once"
     if layout.runs is not None and layout.runs.pause_s is not None and not have & set(TURNS):
-        return f"runs by pauses, but no wheels; expected one of the topics {', '.join(TURNS)}"
+        return f"pause_s without a channel of the wheels; expected one of {', '.join(TURNS)}"
     if layout.definitions is not None and not layout.definitions.is_dir():
-        return f"definitions: no folder {layout.definitions}; expected one with .msg files"
+        return f"definitions: no folder {layout.definitions}; expected a folder with .msg files"
     return None

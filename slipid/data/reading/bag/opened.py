@@ -1,4 +1,4 @@
-"""An open bag with its topics and messages; every damage is reported as a `DataError`."""
+"""An open bag with its topics and messages; any damage is reported as a `DataError`."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -71,7 +71,7 @@ class BagTopic:
             return shape_of(data, self.message, cdr=self.bag.files.storage != "rosbag1")
         except ValueError as error:
             found = f"it is no {self.message.name}: {error}"
-            expected = "messages as their definition says; is the bag damaged?"
+            expected = "messages that match their definition; is the bag damaged?"
             raise self.error(found, expected, number) from error
 
     def shapes(self) -> Iterator[MessageShape]:
@@ -149,7 +149,7 @@ def open_bag(path: Path, definitions: Path | None) -> Iterator[OpenBag]:
         definitions: folder of .msg files, for types whose definition the bag lacks, or None.
 
     Raises:
-        DataError: there is no bag, or it is damaged; the message says how to repair it.
+        DataError: there is no bag, or it is damaged; the message describes how to repair it.
     """
     files = files_of(path)
     with ExitStack() as stack:
@@ -163,8 +163,8 @@ def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str
     The readers are closed with the stack.
     """
     notes = [
-        f"{part.name}-wal has messages of the bag that are not read; "
-        f"to add them run: sqlite3 {part} 'PRAGMA wal_checkpoint'"
+        f"{part.name}-wal contains messages that are not read; to add them run: sqlite3 {part} "
+        "'PRAGMA wal_checkpoint'"
         for part in files.parts
         if (wal := part.with_name(part.name + "-wal")).exists() and wal.stat().st_size
     ]
@@ -175,7 +175,7 @@ def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str
             if any(part.suffix == ".zstd" for part in files.parts) or files.storage != "mcap":
                 raise
             notes.append(
-                f"metadata.yaml does not fit the files, which were read without it ({error})"
+                f"metadata.yaml does not match the files, which were read without it ({error})"
             )
     elif files.path.is_dir():
         notes.append("the folder has no metadata.yaml: the recording was cut off")
@@ -193,8 +193,8 @@ def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str
             readers.append(_reader(whole, files, stack))
             lost = part.stat().st_size - whole.end
             notes.append(
-                f"{part.name} was cut off: it was read up to its last whole record, "
-                f"without the last {lost} bytes"
+                f"{part.name} was cut off: it was read up to its last complete record, without "
+                f"the last {lost} bytes"
             )
     return readers, notes
 
@@ -206,7 +206,7 @@ def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Re
     try:
         if files.storage == "rosbag1":
             return stack.enter_context(rosbag1.Reader(files.path))
-        # `RepairedMcap` has those methods of a path that rosbags calls.
+        # `RepairedMcap` has the methods of a path that rosbags calls.
         return stack.enter_context(rosbag2.Reader(cast(Path, path)))
     except Exception as error:  # rosbags raises many types of errors on damaged bytes
         raise damage_error(files, error) from error
@@ -222,11 +222,13 @@ def damage_error(files: BagFiles, error: Exception) -> DataError:
     if isinstance(error, PermissionError):
         return bad_data(files.path, f"cannot be read ({error.strerror})", "a readable bag")
     if isinstance(error, KeyError) and error.args[0] in ("protobuf", "jsonschema", "flatbuffer"):
-        found = f"it holds messages encoded as {error.args[0]}, which are not read"
-        expected = "ROS messages only; filter them out with: mcap filter"
+        found = f"it contains messages encoded as {error.args[0]}, which cannot be read"
+        expected = "ROS messages only; remove the others with: mcap filter"
         return bad_data(files.path, found, expected)
     if "Profile is not ros2" in text:
-        expected = "one that ROS 2 recorded (profile ros2); write it again with: ros2 bag convert"
+        expected = (
+            "an MCAP file recorded by ROS 2 (profile ros2); convert it with: ros2 bag convert"
+        )
         return bad_data(files.path, "an MCAP file of another profile", expected)
     remedy = _REMEDY[files.storage].format(file=file)
     if "metadata" in text.lower() or "files are missing" in text:

@@ -1,6 +1,6 @@
 """Plan of reading a bag: for each channel its topics, and the numbers to take from their messages.
 
-The module also knows, for common message types, the fields and units that belong to each channel.
+The module also lists, for common message types, the fields and units of each channel.
 """
 
 from dataclasses import dataclass
@@ -59,12 +59,12 @@ _FITTING = {
 
 @dataclass(frozen=True, eq=False)
 class ChannelPlan:
-    """Source of the numbers of a channel, or of a pose or a twist.
+    """Topics and numbers from which a channel, a pose or a twist is read.
 
     Attributes:
         channel: name of the channel, pose or twist in the layout.
         spec: position of the channel in the layout.
-        wanted: each topic, by name, and the numbers to take from its messages.
+        wanted: the numbers to take from the messages of each topic, by the name of the topic.
         unit: unit of the numbers; empty for a pose or a twist, whose numbers are in SI units.
         links: chain of transforms that a pose is composed of; empty for other channels and poses.
     """
@@ -122,15 +122,15 @@ def _transformed(bag: OpenBag, spec: TopicChannel, topic: BagTopic) -> ChannelPl
     if spec.frame is None or spec.child is None:
         edges = (edge for shape in islice(topic.shapes(), 1) for edge in edges_of(shape))
         pairs = first_names(f"{edge.parent} -> {edge.child}" for edge in edges)
-        expected = f"frame and child, the frames that the pose is between ({pairs})"
-        raise topic.error("transforms, without saying which", expected)
+        expected = f"frame and child, the two frames of the pose ({pairs})"
+        raise topic.error("transforms, but the frames are not given", expected)
     links = chain_of(topics[::-1], spec.frame, spec.child)
     wanted = ((one.name, TransformPick(link.edge)) for one in topics for link in links)
     return ChannelPlan("pose", spec, tuple(wanted), links=links)
 
 
 def topic_of(bag: OpenBag, name: str, channel: str) -> BagTopic:
-    """Return a topic of which the messages of a channel are read.
+    """Return a topic from whose messages a channel is read.
 
     Raises:
         DataError: the topic is missing or empty, or has several types.
@@ -139,14 +139,14 @@ def topic_of(bag: OpenBag, name: str, channel: str) -> BagTopic:
     if topic is None:
         found = f"no topic '{name}' for {channel}{did_you_mean(name, bag.topics)}"
         fitting = [one.name for one in bag.topics.values() if _serves(one, channel)]
-        also = ", which hold such messages" if fitting else ""
+        also = ", which have such messages" if fitting else ""
         raise bad_data(bag.files.path, found, f"one of {first_names(fitting or bag.topics)}{also}")
     if not topic.count:
-        found = f"no message in the topic, which holds {channel}"
+        found = f"no message in the topic of {channel}"
         raise topic.error(found, "a topic that was recorded; was its driver on?")
     if " and " in topic.type:
         found = f"messages of several types ({topic.type})"
-        raise topic.error(found, "one type; record them under two names")
+        raise topic.error(found, "one type; record them as two topics")
     return topic
 
 
@@ -201,13 +201,15 @@ def _group_pick(channel: str, spec: TopicChannel, topic: BagTopic) -> Pick:
     """
     message = topic.message
     if channel == "twist_command" and message.name == _ODOMETRY:
-        found = "nav_msgs/Odometry, which holds the measured twist"
+        found = "nav_msgs/Odometry, which contains the measured twist"
         raise topic.error(found, "the commanded twist")
     field = spec.fields[0] if spec.fields else ""
     paths = _group_paths(channel, message, f"{field}." if field else "")
     if not paths:
         where = f" in field '{field}'" if field else ""
-        expected = f"{_FITTING[channel]}; or field = the field that holds it ({_listed(message)})"
+        expected = (
+            f"{_FITTING[channel]}; or field = the field that contains it ({_listed(message)})"
+        )
         raise topic.error(f"no {channel}{where} of type {message.name}", expected)
     return FieldPick(paths)
 
@@ -226,7 +228,7 @@ def _field_pick(channel: str, spec: TopicChannel, topic: BagTopic) -> tuple[Pick
     if not paths:
         fitting = f"{_FITTING[channel]}, or " if channel in _FITTING else ""
         expected = f"{fitting}field = one of its numbers ({_listed(message)}), with its unit"
-        found = f"{message.name}, in which the field of {channel} is unknown"
+        found = f"{message.name}, whose field for {channel} is not known"
         raise topic.error(found, expected)
     for path in paths:
         plain = without_indices(path)
@@ -260,13 +262,13 @@ def _joint_pick(
         raise topic.error(found, f"one of {', '.join(_JOINT_ARRAYS)}")
     unit = spec.unit or _JOINT_ARRAYS[array]
     if unit is None:
-        found = "effort without a unit, and drivers disagree on it"
+        found = "effort without a unit, which differs between drivers"
         raise topic.error(found, f"unit = {EFFORT}")
     _check_unit(channel, array, unit, topic)
     if not joints:
         names = (name for shape in islice(topic.shapes(), 10) for name in shape.texts("name"))
         there = first_names(dict.fromkeys(names))
-        expected = f"joints = their names, in the order of the drives (there are: {there})"
+        expected = f"joints = their names, in the order of the drives (the messages have: {there})"
         raise topic.error("no joints are named", expected)
     return JointPick(joints, array), unit
 
@@ -280,7 +282,7 @@ def _check_unit(channel: str, path: str, unit: str, topic: BagTopic) -> None:
             name: wanted for name, wanted in CHANNELS.items() if name not in ("time", channel)
         }
         fitting = [name for name, wanted in others.items() if converts(unit, wanted)]
-        other = f"; numbers in {unit} belong to {' or '.join(fitting)}" if fitting else ""
+        other = f"; numbers in {unit} are possible for {' or '.join(fitting)}" if fitting else ""
         raise topic.error(f"field '{path}': {error}", f"a field of {channel}{other}") from error
 
 

@@ -1,4 +1,4 @@
-"""Begin and end of the runs in a bag, which a topic, pauses or a table separate."""
+"""Begin and end of the runs in a bag, which are separated by a topic, by pauses or by a table."""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,8 +23,8 @@ from slipid.data.reading.signal import Signal
 from slipid.support.errors import bad_data, did_you_mean
 from slipid.support.toml_file import Section, checked
 
-STILL = 0.02
-"""Change of angle [rad], or speed [rad/s], above which a wheel moves."""
+LEAST_MOTION = 0.02
+"""A wheel counts as moving above this change of angle [rad] or this speed [rad/s]."""
 PAUSE_S = 1.0
 """Least pause between runs that `slipid new` proposes for a bag with one long drive [s]."""
 _Mark = tuple[str | float, str | None, str | None]
@@ -38,8 +38,8 @@ class RunSpan:
     Attributes:
         start: time at which the run starts [s].
         end: time at which the run has ended [s].
-        suffix: suffix that follows the bag's name in the run's name; empty if the run has no name
-            of its own.
+        suffix: text that is appended to the name of the bag to name the run; empty if the run is
+            not named.
         surface: name of the surface, or None.
         load: name of the load set-up, or None.
     """
@@ -77,7 +77,7 @@ def run_spans(
         last = max(float(signal.time[-1]) for signal in signals.values())
         raise bad_data(bag.files.path, *_none(rule, found, f"from {first:.3f} to {last:.3f} s"))
     if len(inside) < len(found):
-        notes.append(f"{len(found) - len(inside)} runs left out that have no samples of the wheels")
+        notes.append(f"{len(found) - len(inside)} runs without samples of the wheels were left out")
     width = 0 if len(inside) == 1 else max(2, len(str(len(inside))))
     numbers = (f"#{k:0{width}d}" if width else "" for k in range(1, len(inside) + 1))
     return tuple(
@@ -100,15 +100,21 @@ def _none(rule: RunRule, found: Sequence[RunSpan], samples: str) -> tuple[str, s
     """Return texts for the error that no run is usable: what was found, and what was expected."""
     times = ", ".join(f"{one.start:.3f} to {one.end:.3f} s" for one in found[:3])
     if rule.pause_s is not None:
-        return "no run: no wheel moves", f"a wheel that turns by more than {STILL:g} rad"
+        return "no run: no wheel moves", f"a wheel that turns by more than {LEAST_MOTION:g} rad"
     if rule.topic is not None and not found:
         between = ", ".join(map(repr, rule.between))
         expected = f"a value other than those between runs ({between})"
         return f"no run in topic '{rule.topic}'", expected
     if rule.topic is not None:
-        expected = f'runs where the samples are, {samples}; perhaps stamp = "received"'
+        expected = (
+            f'runs within the times of the samples, {samples}; perhaps stamp = "received" is needed'
+        )
         return f"no sample in the runs of topic '{rule.topic}' ({times})", expected
-    hint = "" if rule.from_start else "; where times count from the first sample: from_start = true"
+    hint = (
+        ""
+        if rule.from_start
+        else "; if its times are counted from the first sample, set from_start = true"
+    )
     where = f" ({times})" if found else ""
     return f"no run of table {rule.table} lies in the bag{where}", f"times {samples}{hint}"
 
@@ -136,7 +142,7 @@ def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray
     name = next(name for name in TURNS if name in signals)
     time, values = signals[name].time, signals[name].values * per_wheel(name, layout)
     if name.endswith("_speed"):
-        return time[(np.abs(values) > STILL).any(axis=1)]
+        return time[(np.abs(values) > LEAST_MOTION).any(axis=1)]
     if name == "wheel_ticks" and layout.ticks_are_increments:
         values = np.cumsum(values, axis=0)
     moved = {row for column in values.T for row in _moved(column)}
@@ -144,28 +150,29 @@ def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray
 
 
 def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
-    """Return the samples at which an angle [rad] has changed by `STILL` since the last such sample.
+    """Return the samples at which an angle has changed by `LEAST_MOTION` since the last one.
 
-    Therefore neither an encoder that flickers between two ticks nor noise counts as motion.
+    Therefore noise, or an encoder that alternates between two ticks, does not count as motion. The
+    angle is in rad.
     """
     found, held = [], float(angle[0])
     changed = np.flatnonzero(np.diff(angle)) + 1
     for row, value in zip(changed.tolist(), angle[changed].tolist(), strict=True):
-        if abs(value - held) > STILL:
+        if abs(value - held) > LEAST_MOTION:
             held = value
             found.append(row)
     return found
 
 
 def runs_between_pauses(log: Log, pause_s: float) -> int:
-    """Return the number of runs in a log if pauses longer than `pause_s` [s] separated them."""
-    turned = np.abs(np.diff(log.wheel_angle, axis=0)) > STILL * np.diff(log.time)[:, None]
+    """Return the number of runs in a log if pauses longer than `pause_s` [s] separate runs."""
+    turned = np.abs(np.diff(log.wheel_angle, axis=0)) > LEAST_MOTION * np.diff(log.time)[:, None]
     moves = log.time[1:][turned.any(axis=1)]
     return int((np.diff(moves) > pause_s).sum()) + 1 if len(moves) else 0
 
 
 class _RunRow(Section):
-    """One row of a table of runs: begin and end [s], and perhaps names."""
+    """One row of a table of runs: begin and end [s], and optional names."""
 
     start: FiniteFloat
     end: FiniteFloat
@@ -209,9 +216,9 @@ def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
 
 
 def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:
-    """Return a run for each time in which the topic's values stay the same.
+    """Return a run for each interval in which the value of the topic stays the same.
 
-    The values that the rule names as being between runs are no runs.
+    Intervals with one of the values `rule.between` are not runs.
 
     Raises:
         DataError: the topic or a field is missing.
@@ -239,7 +246,7 @@ def _marks(topic: BagTopic, layout: BagLayout, rule: RunRule) -> Iterator[tuple[
         shape = topic.shape(data, number)
         texts, places = shape.texts(rule.field), shape.places(rule.field)
         if not texts and not places:
-            raise topic.error(f"nothing in field '{rule.field}'", "a value in it", number)
+            raise topic.error(f"no value in field '{rule.field}'", "a value in it", number)
         value = texts[0] if texts else float(places[0].of(block)[0])
         surface, load = (_text(shape, path) for path in (rule.surface, rule.load))
         stamp = Located.of(shape).stamp(block) if layout.stamp == "header" else None

@@ -24,7 +24,9 @@ _PATH = re.compile(r"[^\W\d]\w*(\[\d+\])?(\.[^\W\d]\w*(\[\d+\])?)*")
 def check_path(path: str) -> None:
     """Raise `ValueError` if a text is not a path of a field."""
     if not _PATH.fullmatch(path):
-        raise ValueError(f"no path of a field: '{path}'; expected such as motors[0].current")
+        raise ValueError(
+            f"not a path of a field: '{path}'; expected a path such as motors[0].current"
+        )
 
 
 def without_indices(path: str) -> str:
@@ -133,7 +135,7 @@ def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
     Args:
         raw: bytes of the message.
         message: type of the message.
-        cdr: whether the message is serialised as in ROS 2 (CDR), not as in ROS 1.
+        cdr: True if the message is serialised as in ROS 2 (CDR), not as in ROS 1.
 
     Raises:
         ValueError: the bytes are not a message of this type; the text says why.
@@ -142,7 +144,7 @@ def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
     leaves = tuple(walk.leaves(message, ""))
     over = len(raw) - walk.at
     if not 0 <= over < (4 if cdr else 1):
-        raise ValueError(f"{over} bytes are left over after its last field")
+        raise ValueError(f"{over} bytes remain after its last field")
     fixed = np.concatenate([np.arange(0), *(np.arange(a, b) for a, b in walk.fixed)])
     return MessageShape(len(raw), leaves, fixed, np.frombuffer(raw, np.uint8)[fixed])
 
@@ -152,7 +154,7 @@ class _MessageWalk:
 
     Attributes:
         raw: bytes of the message.
-        cdr: whether the message is serialised as in ROS 2 (CDR).
+        cdr: True if the message is serialised as in ROS 2 (CDR).
         order: byte order of numbers, `<` or `>`.
         at: position of the next byte.
         origin: position from which alignment counts.
@@ -206,7 +208,7 @@ class _MessageWalk:
         first = self.at
         self.at += size * count
         if self.at > len(self.raw):
-            raise ValueError(f"it ends after {len(self.raw)} bytes, within its fields")
+            raise ValueError(f"it ends after {len(self.raw)} bytes, before the end of its fields")
         return first
 
     def length(self) -> int:

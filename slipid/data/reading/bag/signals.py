@@ -18,14 +18,14 @@ from slipid.data.reading.signal import Signal, SignalSource, first_true
 from slipid.data.reading.units import factor
 from slipid.support.errors import bad_data, did_you_mean, first_names
 
-APART_NOTED = 0.5
-"""Difference between stamps and times of receipt above which there is a note [s]."""
-APART_REFUSED = 60.0
-"""Difference between stamps and times of receipt above which they cannot be combined [s]."""
-ABSURD = 1e30
-"""Magnitude that no sensor measures in any unit; such a number means that the bag is damaged."""
+NOTED_DIFFERENCE_S = 0.5
+"""Larger differences between stamps and times of receipt are noted [s]."""
+LARGEST_DIFFERENCE_S = 60.0
+"""If stamps and times of receipt differ by more, they cannot be combined [s]."""
+LARGEST_NUMBER = 1e30
+"""Larger magnitudes cannot be measurements in any unit and mean that the bag is damaged."""
 TILT_NOTED = np.radians(20.0)
-"""Tilt of a pose above which there is a note, since the z axis may not point up [rad]."""
+"""A larger tilt of a pose is noted, since the z axis may not point up [rad]."""
 _RECEIVED = 'to use the time of receipt set stamp = "received"'
 
 
@@ -44,7 +44,9 @@ def cleaned(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
         every = len(zero) == len(time)
         found = "every time stamp is zero" if every else "the time stamp is zero"
         expected = (
-            f"stamps that count; {_RECEIVED}" if every else f"a stamp everywhere; {_RECEIVED}"
+            f"time stamps that are set; {_RECEIVED}"
+            if every
+            else f"a time stamp in every message; {_RECEIVED}"
         )
         raise stream.error(found, expected, None if every else int(zero[0]))
     if (np.diff(time) > 0).all():
@@ -54,7 +56,7 @@ def cleaned(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
         found = f"the clock jumps back by {late[jump] / 1e9:.3g} s"
         expected = (
             f"messages late by at most max_disorder = {layout.max_disorder:g} s; was the clock "
-            f"set, or a recording added? Else {_RECEIVED}"
+            f"set, or a second recording appended? Otherwise {_RECEIVED}"
         )
         raise stream.error(found, expected, jump)
     if disordered := int((late > 0).sum()):
@@ -63,15 +65,19 @@ def cleaned(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
     order = np.argsort(time, kind="stable")
     last = np.append(np.diff(time[order]) != 0, True)
     if repeated := int((~last).sum()):
-        notes.append(f"topic {name}: {repeated} messages with the stamp of another left out")
+        notes.append(
+            f"topic {name}: {repeated} messages with the same stamp as another were left out"
+        )
     return stream.part(order[last])
 
 
 def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> None:
-    """Append a note if stamps and times of receipt are both used and differ by `APART_NOTED`.
+    """Append a note if stamps and times of receipt are both used and clearly differ.
+
+    The note is added for differences from `NOTED_DIFFERENCE_S` on.
 
     Raises:
-        DataError: they differ by more than `APART_REFUSED`.
+        DataError: they differ by more than `LARGEST_DIFFERENCE_S`.
     """
     used = [one for one in streams if len(one.number) and not one.topic.name.endswith(STATIC)]
     bare = sorted({one.topic.name for one in used if one.delay is None})
@@ -80,13 +86,13 @@ def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str])
         return
     apart, topic = max(delays, key=lambda item: abs(item[0]))
     found = (
-        f"stamps of {topic} differ by {apart:.3g} s from the time of receipt, the only time of "
-        f"{', '.join(bare)}"
+        f"stamps of {topic} differ by {apart:.3g} s from the time of receipt, which is the only "
+        f"time that {', '.join(bare)} has"
     )
-    if abs(apart) > APART_REFUSED:
+    if abs(apart) > LARGEST_DIFFERENCE_S:
         expected = 'one clock for all: set stamp = "received"'
         raise bad_data(used[0].topic.bag.files.path, found, expected)
-    if abs(apart) > APART_NOTED:
+    if abs(apart) > NOTED_DIFFERENCE_S:
         notes.append(found)
 
 
@@ -122,7 +128,7 @@ def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) 
     Args:
         streams: streams with the columns.
         notes: list to which notes are appended.
-        by_name: whether all streams have the same columns, so that each column is taken from the
+        by_name: True if all streams have the same columns, so that each column is taken from the
             first stream with numbers in it; else all columns of all streams are used.
 
     Raises:
@@ -147,8 +153,8 @@ def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) 
         raise source.error("its columns share no time", "columns that were recorded together")
     gap = max(float(np.diff(one.time).max(initial=0.0)) for one in signals)
     notes.append(
-        f"topics {topics}: {', '.join(names[1:])} came at other times than {names[0]} and were "
-        f"interpolated to them (longest gap {gap:.3g} s)"
+        f"topics {topics}: {', '.join(names[1:])} were sampled at other times than {names[0]} and "
+        f"were interpolated to its times (longest gap {gap:.3g} s)"
     )
     columns = zip(signals, pairs, strict=True)
     values = [np.interp(time, one.time, one.values[:, j]) for one, (_, j) in columns]
@@ -169,18 +175,18 @@ def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
     Raises:
         DataError: there are other numbers that are not finite, or no row is left.
     """
-    bad = ~np.all(np.abs(stream.values) < ABSURD, axis=1)
+    bad = ~np.all(np.abs(stream.values) < LARGEST_NUMBER, axis=1)
     if not bad.any():
         return stream
     rows = np.flatnonzero(bad)
     numbers = stream.values[rows[0]]
-    j = int(np.argmin(np.abs(numbers) < ABSURD))
+    j = int(np.argmin(np.abs(numbers) < LARGEST_NUMBER))
     if bad.all() or not layout.drop_nan or not np.isnan(stream.values[rows]).any(axis=1).all():
-        found = f"{stream.columns[j]} is {numbers[j]:.3g} here, the first of {len(rows)} such"
+        found = f"{stream.columns[j]} is {numbers[j]:.3g}, the first of {len(rows)} such values"
         found += f" among {len(bad)} messages"
         expected = "numbers; to leave out messages with nan set drop_nan = true"
         if bad.all():
-            expected = "numbers; does the driver fill this field in?"
+            expected = "numbers; does the driver fill in this field?"
         raise stream.error(found, expected, int(rows[0]))
     column = stream.columns[j]
     notes.append(
@@ -216,7 +222,7 @@ def channel_signal(
     columns = samples.values.shape[1]
     scale = np.array(plan.spec.scale)
     if len(scale) not in (1, columns):
-        found = f"{plan.channel} has {columns} columns for {len(scale)} scales"
+        found = f"{plan.channel} has {columns} columns, but {len(scale)} scales"
         raise samples.source.error(found, "as many, or one scale for all")
     if plan.channel not in PER_WHEEL and columns != 1:
         found = f"{columns} numbers for {plan.channel}"
@@ -234,16 +240,16 @@ def checked_stream(stream: Stream) -> Stream:
 
 
 def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
-    """Raise `DataError` if a joint is in no message, or has no number in any."""
+    """Raise `DataError` if a joint is missing from all messages, or never has a number."""
     picks = [pick for _, pick in plan.wanted if isinstance(pick, JointPick)]
     there = list(dict.fromkeys(name for pick in picks for name in pick.names))
     for j, joint in enumerate(picks[0].columns):
         if joint not in there:
             found = f"no joint '{joint}'{did_you_mean(joint, there)}"
-            raise streams[0].error(found, f"one of the names that are there: {first_names(there)}")
+            raise streams[0].error(found, f"one of the names in the messages: {first_names(there)}")
         if all(stream.absent[:, j].all() for stream in streams):
             found = f"{picks[0].array} of joint '{joint}' is empty in every message"
-            expected = "numbers in it; is another field meant: position, velocity or effort?"
+            expected = "numbers; is another field meant: position, velocity or effort?"
             raise streams[0].error(found, expected)
 
 
@@ -266,7 +272,8 @@ def group_signals(
     else:
         samples = whole_signal(cleaned(checked_stream(streams[0]), layout, notes), notes)
     values = _planar(samples, notes) if plan.channel == "pose" else samples.values
-    # A heading from a quaternion is named by it; all columns of a composed pose have one name.
+    # A heading from a quaternion has the name of the quaternion; all columns of a composed pose
+    # have one name.
     named = samples.source.columns
     if len(named) == 1:
         named *= 3
@@ -290,7 +297,7 @@ def _planar(samples: Signal, notes: list[str]) -> Float[np.ndarray, "sample 3"]:
     if (tilted := float(tilt(rotation).max(initial=0.0))) > TILT_NOTED:
         notes.append(
             f"topic {samples.source.topic}: the pose tilts by up to {np.degrees(tilted):.0f} deg; "
-            "its heading is about the z axis of the frame: does that point up?"
+            "its heading is the rotation about the z axis of the frame: does that axis point up?"
         )
     return np.column_stack([place, heading(rotation)])
 
@@ -317,11 +324,16 @@ def _transformed(
     edge = max(moving, key=lambda edge: len(moving[edge].time))
     source, densest = sources[edge], moving[edge].time
     if len(densest) == 1:
-        found = f"every transform from '{plan.spec.frame}' to '{plan.spec.child}' is there once"
-        raise source.error(found, "one that changes with time: frames that move")
+        found = (
+            f"every transform from '{plan.spec.frame}' to '{plan.spec.child}' was published only "
+            "once"
+        )
+        raise source.error(found, "at least one that changes with time, between frames that move")
     whole = composed(plan.links, moving)
     if not len(whole.time):
-        found = f"the transforms from '{plan.spec.frame}' to '{plan.spec.child}' share no time"
+        found = (
+            f"the transforms from '{plan.spec.frame}' to '{plan.spec.child}' do not overlap in time"
+        )
         raise source.error(found, "transforms that were recorded together")
     lines = source.lines[np.searchsorted(densest, whole.time)]
     columns = (f"{plan.spec.child} in {plan.spec.frame}",)

@@ -46,7 +46,8 @@ class BagFiles:
     def sha256(self) -> str:
         """Return the SHA-256 hash of the bag.
 
-        It is the hash of the file, or for several files that of the text that `sha256sum` prints.
+        For a single file it is the hash of the file; for several files, that of the text that
+        `sha256sum` prints about them.
         """
         files = [*self.parts, *([self.metadata] if self.metadata else [])]
         if len(files) == 1:
@@ -98,7 +99,7 @@ def _storage_of(path: Path) -> Storage:
     for storage, magic in _MAGIC.items():
         if start.startswith(magic):
             if path.suffix != _SUFFIX[storage]:
-                expected = f"a name that says so; rename it to {path.stem}{_SUFFIX[storage]}"
+                expected = f"the suffix of this format; rename it to {path.stem}{_SUFFIX[storage]}"
                 raise bad_data(path, f"a {storage} bag", expected)
             return storage
     raise bad_data(path, f"not a bag (it starts with {start[:8]!r})", EXPECTED)
@@ -126,7 +127,7 @@ _END = struct.pack("<BQQQI", _FOOTER, 20, 0, 0, 0) + _MAGIC["mcap"]
 
 @dataclass(frozen=True)
 class RepairedMcap:
-    """Object like a path, which opens a cut MCAP file as if it were complete.
+    """Path-like object that opens a cut-off MCAP file as if it were complete.
 
     Attributes:
         path: path of the file.
@@ -146,7 +147,7 @@ class RepairedMcap:
 
 
 def repaired(path: Path) -> RepairedMcap | None:
-    """Return a cut MCAP file up to its last complete record, or None if it has no message."""
+    """Return a cut-off MCAP file up to its last complete record, or None if it has no message."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(8) != _MAGIC["mcap"]:

@@ -18,13 +18,13 @@ from slipid.support.errors import DataError
 BATCH_BYTES = 1 << 20
 """Size of the messages of one topic that are processed together [byte]."""
 MAX_SHAPES = 256
-"""Largest number of known shapes of a topic; when it is reached, all are forgotten, to save memory
-and time."""
+"""Largest number of remembered shapes of a topic; when it is reached, all are discarded, to save
+memory and time."""
 FEW_SHAPES = 16
 """Number of new shapes in a batch with which all its messages are compared; after these, every
-message is decoded on its own."""
+message is decoded separately."""
 STAMPS = ("header.stamp", "stamp")
-"""Paths at which a message may have its own time."""
+"""Paths at which a message may have a time stamp."""
 POSITION = ("translation.x", "translation.y", "translation.z")
 ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
 
@@ -52,7 +52,8 @@ class Located:
     """Places of the picked numbers in messages of one shape.
 
     Attributes:
-        time: places of the seconds and nanoseconds of the message's own time; None if it has none.
+        time: places of the seconds and nanoseconds of the message's time stamp; None if it has
+            none.
         numbers: places of the picked numbers in order, None for a number that is not in these
             messages.
     """
@@ -64,7 +65,7 @@ class Located:
     def of(
         cls, shape: MessageShape, numbers: Sequence[BytePlace | None] = (), part: str = ""
     ) -> "Located":
-        """Return the places with that of the time of the message, or of a part of it.
+        """Return the places of the numbers and of the time stamp of the message or of a part of it.
 
         `part` is the path of the part, followed by a dot.
         """
@@ -77,7 +78,7 @@ class Located:
         return cls(None, tuple(numbers))
 
     def stamp(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"] | None:
-        """Return the messages' own times [ns], or None if they have none."""
+        """Return the time stamps of the messages [ns], or None if they have none."""
         if self.time is None:
             return None
         seconds, nanoseconds = (place.of(block, np.int64) for place in self.time)
@@ -160,8 +161,8 @@ class TransformPick:
 
 
 Pick = FieldPick | JointPick | TransformPick
-"""Rule that picks numbers from the messages of a topic. A message yields any number of rows: for
-example none if it lacks the numbers."""
+"""Rule that picks numbers from the messages of a topic. A message may yield several rows, or none
+if it does not have the numbers."""
 _Places = list[tuple[Located, ...]]
 """For each pick, the places of each of its rows of numbers in messages of one shape."""
 
@@ -189,7 +190,7 @@ class Stream:
     absent: Bool[np.ndarray, "row column"]
 
     def error(self, found: str, expected: str, row: int | None = None) -> DataError:
-        """Return the error about a row, counted from 0, or (None) about the topic."""
+        """Return the error about a row, counted from 0, or, if it is None, about the topic."""
         return self.topic.error(found, expected, None if row is None else int(self.number[row]))
 
     def part(self, which: Int[np.ndarray, " part"] | Bool[np.ndarray, " row"]) -> "Stream":
@@ -206,8 +207,8 @@ def collected(
     Args:
         bag: the bag.
         picks: picks by the name of their topic.
-        stamp: clock of the result: that of the messages' own stamps, where they have one, or that
-            of the recorder.
+        stamp: "header" for times from the stamps in the messages, if they have one; "received" for
+            the times of receipt.
     """
     topics = {name: _Collector(bag.topics[name], few) for name, few in picks.items()}
     for name, received, data in bag.messages(tuple(topics)):
@@ -250,7 +251,7 @@ class _Collector:
             self._take()
 
     def stream(self, pick: int, stamped: bool) -> Stream:
-        """Return all rows of a pick, given by its index, if possible at their stamps."""
+        """Return all rows of the pick with an index, at the times of their stamps if possible."""
         self._take()
         columns, none = self.picks[pick].columns, np.zeros(0, dtype=np.int64)
         empty = np.zeros((0, len(columns)))
@@ -258,8 +259,8 @@ class _Collector:
         width = parts[0].values.shape[1]
         for part in parts:
             if part.values.shape[1] != width:
-                found = f"{part.values.shape[1]} numbers, and {width} of them before"
-                expected = "as many in every message; name one by its index, such as [0]?"
+                found = f"{part.values.shape[1]} numbers, but {width} in earlier messages"
+                expected = "the same number in every message; select one by its index, such as [0]?"
                 raise self.topic.error(found, expected, int(part.number[0]))
         stamps, *columns_of_rows = zip(*parts, strict=True)
         received, number, values, absent = map(np.concatenate, columns_of_rows)
@@ -272,7 +273,7 @@ class _Collector:
         return stream if in_order else stream.part(np.argsort(number, kind="stable"))
 
     def _take(self) -> None:
-        """Take the numbers from the messages that wait, and forget these."""
+        """Take the numbers from the waiting messages, and discard these messages."""
         received = np.array(self._received, dtype=np.int64)
         for which, block, places in self._by_shape():
             number = self._count + 1 + which

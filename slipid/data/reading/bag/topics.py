@@ -1,7 +1,7 @@
 """Topics and runs of a bag.
 
 `topics_of` describes every topic by its first messages, without reading the whole bag. `read_bag`
-returns the runs of a bag, each with all channels of a layout at their own times.
+returns the runs of a bag, each with all channels of a layout at the times of their sensors.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +22,7 @@ from slipid.data.reading.signal import Identity, RawRun, Signal
 from slipid.support.errors import DataError
 
 _FIRST_MESSAGES = 10
-"""Number of first messages of a topic that its description is based on."""
+"""Number of first messages of a topic from which it is described."""
 _SELF_EXPLAINED = (
     "pose",
     "twist_command",
@@ -58,7 +58,7 @@ class Topic:
         name: name of the topic.
         type: type of the messages, such as `sensor_msgs/msg/JointState`.
         count: number of messages.
-        rate: median rate of the first messages [Hz]; None if there are too few to tell.
+        rate: median rate of the first messages [Hz]; None if there are too few messages.
         fields: fields of the messages; empty if there is no message or they could not be examined.
         joints: names of joints in the first messages of type JointState.
         frames: parent and child of each transform in the first messages, as `map -> base_link`.
@@ -130,7 +130,7 @@ def read_bag(known: Identity, layout: BagLayout) -> list[RawRun]:
     twist_command_x, _y and _yaw.
 
     Args:
-        known: name of the bag, its path, and the surface and load set-up that hold where the bag
+        known: name of the bag, its path, and the surface and load set-up that are used if the bag
             and the table of its runs name none. The path is that of a .bag, .db3 or .mcap file, of
             the folder of a rosbag2, or of the metadata.yaml in it.
         layout: layout of the bag.
@@ -146,7 +146,7 @@ def read_bag(known: Identity, layout: BagLayout) -> list[RawRun]:
         signals = _signals(bag, layout, notes)
         spans = run_spans(bag, layout, signals, notes)
         known = replace(known, sha256=sha256.result())
-        # If two channels come from one topic, its notes occur twice.
+        # If two channels are read from one topic, its notes occur twice.
         return [_run(known, span, signals, tuple(dict.fromkeys(notes))) for span in spans]
 
 
@@ -191,7 +191,7 @@ def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Sig
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{count} in {name}" for name, count in counts.items())
         raise DataError(
-            f"{bag.files.path}: channels disagree on the number of wheels: {listed}; expected the "
-            'same of each; name those that count by index (field = ["currents[0]", "currents[1]"])'
+            f"{bag.files.path}: channels have different numbers of wheels: {listed}; expected the "
+            'same number in all; select elements by index (field = ["currents[0]", "currents[1]"])'
         )
     return signals

@@ -42,7 +42,7 @@ class TransformSeries:
         """Return the transform at other times [s].
 
         Translations are interpolated linearly, rotations linearly along the shorter arc. A single
-        sample holds for all times.
+        sample is used for all times.
         """
         if len(self.time) == 1:
             rows = np.zeros(len(time), dtype=int)
@@ -62,7 +62,7 @@ class TransformSeries:
         return TransformSeries(self.time, -back.apply(self.translation), back.as_quat())
 
     def then(self, other: "TransformSeries") -> "TransformSeries":
-        """Return this transform followed by another, whose parent is this one's child.
+        """Return the composition of this transform with one whose parent is the child of this one.
 
         Both have the same times.
         """
@@ -74,8 +74,8 @@ class TransformSeries:
 def composed(links: Sequence[ChainLink], moving: Mapping[Edge, TransformSeries]) -> TransformSeries:
     """Return the pose of a chain's last frame in its first frame.
 
-    It has the times of the transform with the most samples, without those outside the record of
-    another transform.
+    It has the times of the transform with the most samples, as far as all other transforms were
+    recorded then.
     """
     densest = max((moving[link.edge] for link in links), key=lambda one: len(one.time))
     time = densest.time

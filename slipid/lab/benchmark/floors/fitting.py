@@ -12,9 +12,9 @@ the cell and rho a soft absolute value. Currents are correlated for seconds and 
 run. A cell of n rows therefore has a weight proportional to n / (1 + n / 20), and the weight of a
 whole run saturates above `RUN_ROWS` rows.
 
-Ammeters. The Husky's ammeters measure the current that a motor takes from the battery. Where the
-floor pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter reads zero.
-Within a row the current scatters, so the mean reading is that of a clipped normal variable,
+Ammeters. The Husky's ammeters measure the current that a motor takes from the battery. If the floor
+pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter shows zero. Within
+a row the current scatters, so the mean reading is that of a clipped normal variable,
 
     E[max(I + n, 0)] = I Phi(I / s) + s phi(I / s),   n ~ N(0, s^2)
 
@@ -49,7 +49,7 @@ CELL_ROWS, RUN_ROWS = 20.0, 300.0
 """Numbers of rows, in one cell and in one run, above which more rows add little weight."""
 FLOOR_CELLS = 512
 """Largest number of cells of a floor; fewer are padded to it, so that one shape is compiled."""
-SAME_SPEED = 1e-3
+SPEED_STEP = 1e-3
 """Width to which wheel speeds are rounded; rows with equal rounded speeds are one cell [rad/s]."""
 
 
@@ -79,7 +79,7 @@ class Cells:
         take = run.moving & np.isfinite(run.current).all(axis=1)
         speed, amps = run.speed[take], run.current[take]
         gyro = np.full(len(speed), np.nan) if run.gyro is None else run.gyro[take]
-        same = np.round(speed / SAME_SPEED)
+        same = np.round(speed / SPEED_STEP)
         first, cell, count = np.unique(
             same, axis=0, return_index=True, return_inverse=True, return_counts=True
         )[1:]
@@ -164,7 +164,7 @@ def currents_off(
     speed: Float[np.ndarray, "row drive"],
     current: Float[np.ndarray, "row drive"],
 ) -> Float[np.ndarray, "row drive"]:
-    """Return the modelled less the measured current of each row and drive on a floor [A].
+    """Return modelled less measured current of each row and drive on a floor [A].
 
     Rows are evaluated in groups of `FLOOR_CELLS`, the last one padded, so that one shape is
     compiled.

@@ -1,6 +1,6 @@
 """Floor classification on the data set `borealtc`: a Husky on five floors, without a pose.
 
-The robot is built from its maker's data and the measured behaviour of its motors and ammeters.
+The robot is described by data of its manufacturer and by measurements of its motors and ammeters.
 Without a pose the torque constant is not identified: frictions scale with the assumed constant, and
 only ratios of frictions of different floors are meaningful.
 
@@ -33,24 +33,25 @@ RADIUS = 0.165
 """Wheel radius [m]."""
 MASS = 60.0
 """Mass of the robot [kg]."""
-ZERO_A = 0.59
+REST_READING_A = 0.59
 """Reading of the ammeters for wheels at rest, subtracted from all readings [A]."""
-FREE_A, FREE_AS = 0.54, 0.032
+NO_LOAD_A, NO_LOAD_SLOPE = 0.54, 0.032
 """Motor current of a wheel that turns in the air: at low speed [A], and its increase per wheel
 speed [A s/rad]."""
 
 FOLDER = "borealtc"
 ABOUT = (
-    "Husky on five floors, no pose: wheel speeds, sizes of currents and a gyro, 6.5 rows a second"
+    "Husky on five floors, without poses: wheel speeds, magnitudes of currents and a gyro, 6.5 "
+    "rows per second"
 )
 COLUMNS = ("time", "curL", "curR", "velL", "velR", "gyro_z", "accel_std")
 """Columns that are read: time [s], magnitudes of the currents of the left and right motors [A], rim
 speeds left and right [m/s], yaw rate [rad/s], and the std of the vertical acceleration since the
 previous row [m/s^2]."""
 LAYOUT = Layout({name: Channel(columns=(name,), unit="1") for name in COLUMNS})
-NEEDED = COLUMNS[:5]
+REQUIRED_COLUMNS = COLUMNS[:5]
 """Columns in which a missing value is an error: time, currents and rim speeds."""
-LONGEST_S = 0.5
+LARGEST_GAP_S = 0.5
 """Time between two rows above which a file is split into two runs there [s]."""
 FEWEST_ROWS = 3
 """Smallest number of rows of a run; shorter runs are omitted."""
@@ -62,8 +63,8 @@ def husky() -> Robot:
     gain = float(robot.motor.gain)
     motor = replace(
         robot.motor,
-        coulomb_friction=jnp.asarray(gain * FREE_A),
-        viscous_friction=jnp.asarray(gain * FREE_AS),
+        coulomb_friction=jnp.asarray(gain * NO_LOAD_A),
+        viscous_friction=jnp.asarray(gain * NO_LOAD_SLOPE),
     )
     return replace(robot, motor=motor, body=replace(robot.body, mass=jnp.asarray(MASS)))
 
@@ -71,7 +72,7 @@ def husky() -> Robot:
 def read_floor_runs(root: Path, wheel_radius: float) -> list[FloorSignals]:
     """Read the runs of a skid-steer robot below a folder, one folder per floor, as in `borealtc`.
 
-    A file is one run, or several where rows are more than `LONGEST_S` apart.
+    A file is one run, or several where rows are more than `LARGEST_GAP_S` apart.
 
     Args:
         root: the folder.
@@ -91,7 +92,7 @@ def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
     table = read_table(path, LAYOUT)
     if len(table.values) < FEWEST_ROWS:
         raise bad_data(path, f"{len(table.values)} rows", f"at least {FEWEST_ROWS}")
-    for name in NEEDED:
+    for name in REQUIRED_COLUMNS:
         missing = np.flatnonzero(~np.isfinite(table[name]))
         if len(missing):
             row = int(table.lines[missing[0]])
@@ -109,14 +110,14 @@ def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
         gyro=table["gyro_z"],
         vibration=table["accel_std"],
     )
-    edges = [0, *(np.flatnonzero(np.diff(whole.time) > LONGEST_S) + 1), len(whole)]
+    edges = [0, *(np.flatnonzero(np.diff(whole.time) > LARGEST_GAP_S) + 1), len(whole)]
     runs = [whole.rows(int(a), int(b)) for a, b in pairwise(edges)]
     return [run for run in runs if len(run) >= FEWEST_ROWS]
 
 
 def husky_classifiers() -> list[FloorClassifier]:
     """Return all floor classifiers before their fit, slipid's first."""
-    slipid = SlipidFloorClassifier(robot=husky(), zero_a=ZERO_A)
+    slipid = SlipidFloorClassifier(robot=husky(), zero_a=REST_READING_A)
     return [slipid, CosineEnergyClassifier(), GaussianClassifier(), *tree_classifiers()]
 
 

@@ -1,11 +1,11 @@
 """Evaluation of floor classifiers on held-out runs, after different lengths of signals.
 
-Runs are dealt into folds, floor by floor, so that every run is held out once. A classifier picks
-its settings by a cross-validation of the same kind among its training runs. Answers are read after
-several times, such as 0.5 s and 8 s (`SECONDS`). Held-out runs are cut into consecutive stretches
-whose length is the longest of these times. In each stretch the classifier starts anew, and its
-answer is read after each of the times. A stretch counts for a time if it is at least that long and
-the robot moves in at least half of its rows up to that time.
+The runs of each floor are distributed over folds, so that every run is held out once. The settings
+of a classifier are selected by a cross-validation of the same kind among its training runs. Answers
+are evaluated after several times, such as 0.5 s and 8 s (`SECONDS`). Held-out runs are divided into
+consecutive stretches whose length is the longest of these times. The classifier is restarted in
+each stretch, and its answer is evaluated after each of the times. A stretch is used for a time if
+it is at least that long and the robot moves in at least half of its rows up to that time.
 """
 
 import abc
@@ -26,7 +26,7 @@ from slipid.lab.benchmark.floors.result import (
 )
 from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.tuning import Tuned, best_candidate
-from slipid.lab.benchmark.work import OF_FITS, OF_ROWS, BenchmarkOptions
+from slipid.lab.benchmark.work import FIT_SOURCES, ROW_SOURCES, BenchmarkOptions
 from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals
 from slipid.predict.slip_model import RobotSpec
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
@@ -34,11 +34,11 @@ from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""Times from the start of a stretch after which answers are read [s]."""
+"""Times from the start of a stretch after which answers are evaluated [s]."""
 QUICK_SECONDS = (0.5, 1.0, 2.0)
 """These times in a quick evaluation [s]."""
 CLASSIFIER_FOLDS, CLASSIFIER_INNER_FOLDS = 5, 2
-"""Numbers of folds: of the evaluation, and of the inner cross-validation that picks settings."""
+"""Numbers of folds: of the evaluation, and of the inner cross-validation that selects settings."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ def answers_of(
 def answers_after(
     stretch: FloorSignals, beliefs: Beliefs, labels: Sequence[str], seconds: Sequence[float]
 ) -> list[Answer]:
-    """Return the answers in one stretch after each of the times for which the stretch counts.
+    """Return the answers in one stretch after each of the times for which the stretch is used.
 
-    The module's docstring defines for which times a stretch counts.
+    The module's docstring defines the times for which a stretch is used.
 
     Args:
         stretch: signals of the stretch.
@@ -125,7 +125,7 @@ def tuned_classifier(
     """Return the candidate with the highest accuracy in an inner cross-validation.
 
     The accuracy is averaged over all times (`settings.seconds`); the first of equally good
-    candidates is taken.
+    candidates is used.
     """
     fold = folds_of(runs, settings.inner)
 
@@ -176,7 +176,7 @@ def attempted(work: Callable[[], FoldScore[Answer]]) -> FoldScore[Answer]:
     """Return the result of `work()`; if it raises, an empty one with the reason."""
     try:
         return work()
-    except Exception as error:  # a row that fails does not stop the evaluation of others
+    except Exception as error:  # A row that fails does not stop the evaluation of the others.
         return FoldScore.of_error(error)
 
 
@@ -264,7 +264,7 @@ class FloorTask(abc.ABC):
 
     @abc.abstractmethod
     def log_hash(self) -> str:
-        """Return a hash of the logs that the table depends on."""
+        """Return a hash of the logs from which the table is made."""
 
     @abc.abstractmethod
     def make(self) -> ClassifierTable:
@@ -279,7 +279,7 @@ class FloorTask(abc.ABC):
     @property
     def checkpoint(self) -> Checkpoint:
         """Checkpoint in which the table is saved; its key depends on logs, options and code."""
-        code = source_hash(*OF_FITS, *OF_ROWS)
+        code = source_hash(*FIT_SOURCES, *ROW_SOURCES)
         key = key_of(self.log_hash(), self.options.quick, self.options.only, code)
         return Checkpoint(self.options.out / "kept" / self.name / key[:12], key)
 
@@ -291,11 +291,13 @@ class FloorTask(abc.ABC):
         if found is None or "failed" in found or any(row["absent"] for row in found["rows"]):
             try:
                 kept.save_json(self.name, self.make())
-            except Exception as error:  # a task that fails does not stop the others
+            except Exception as error:  # A task that fails does not stop the others.
                 kept.save_json(self.name, {"failed": FoldScore.of_error(error).absent})
         return self.name
 
     def table(self) -> Content:
         """Return the saved table in the form of benchmark.json."""
-        found: Content = self.checkpoint.load_json(self.name) or {"failed": "it was not kept"}
+        found: Content = self.checkpoint.load_json(self.name) or {
+            "failed": "the result was not saved"
+        }
         return found

@@ -3,8 +3,8 @@
 Runs are split by headings, as elsewhere in the benchmark, and start where the wheels have moved a
 centimetre; none of them contains a stop or a second start. The row of slipid is the deployed
 estimator with its default settings, from a fit to the training runs with their poses. It is given
-the load set-up of a run, as a robot in service is. The other rows use neither poses nor loads, and
-are fitted to runs with all loads together.
+the load set-up of a run, which a real robot knows as well. The other rows use neither poses nor
+loads, and are fitted to runs with all loads together.
 """
 
 import time
@@ -34,7 +34,7 @@ from slipid.predict.slip_model import PredictedRun, Run
 SOURCE, KIND = "robotino2022", "headings"
 SECONDS = (0.5, 1.0, 2.0, 4.0)
 """Times after which answers are read [s]; steps last about 0.3 s, runs 6 s or more."""
-ABOUT = "Robotino on four floors, straight runs: wheel speeds and sizes of currents"
+ABOUT = "Robotino on four floors, straight runs: wheel speeds and magnitudes of currents"
 
 
 def robotino_classifiers() -> list[FloorClassifier]:
@@ -74,7 +74,9 @@ def floor_signals(run: Run) -> FloorSignals:
     """
     signals = run.signals
     if signals.current is None:
-        raise ValueError(f"{signals.name}: no current; classifiers of floors need it")
+        raise ValueError(
+            f"{signals.name}: no currents; expected currents, which floor classifiers need"
+        )
     return FloorSignals(
         name=signals.name,
         floor=base_of(run.floor),

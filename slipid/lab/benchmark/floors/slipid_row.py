@@ -15,8 +15,7 @@ Parameters of floors, motors and scatters come from the training runs. `SETTINGS
 the model of the ammeters and the weights in `slipid.lab.benchmark.floors.fitting` are not picked by
 an inner cross-validation, as settings of other rows are: they were set by hand after about a
 hundred variants were compared by their cross-validated accuracy on `borealtc`. The accuracy of
-slipid on `borealtc` is therefore optimistic, to the extent that this choice was tuned to these
-runs.
+slipid on `borealtc` is therefore optimistic, as far as this choice was tuned to these runs.
 """
 
 from collections.abc import Sequence
@@ -50,7 +49,7 @@ HIGHEST_A, HIGHEST_SPEED = 100.0, 20.0
 
 
 def deployed(robot: Robot) -> DeployedRobot:
-    """Return the robot in its deployed form, with its parameters as they are.
+    """Return the robot in its deployed form, with unchanged parameters.
 
     Fields of the record that the floor filter does not use, such as the uncertainty and the ranges
     of a fit, are filled with values that have no effect.

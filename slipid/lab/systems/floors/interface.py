@@ -1,7 +1,7 @@
 """Interface of floor classifiers: the signals that they use, and the beliefs that they return.
 
-A classifier is fitted to runs whose floor is known. It then goes through other runs row by row and
-gives the probability of every floor after each row, from that row and earlier ones alone.
+A classifier is fitted to runs whose floor is known. It then processes other runs row by row and
+returns the probability of every floor after each row, from that row and earlier ones only.
 
 Features of a row are causal: they are computed over trailing windows of fixed length in seconds,
 which end with the row itself:
@@ -106,14 +106,14 @@ class FloorClassifier(abc.ABC):
 
     Attributes:
         name: name of its row in the tables.
-        labels: floors that it was fitted to, in the order of its beliefs; empty before a fit.
+        labels: floors to which it was fitted, in the order of its beliefs; empty before a fit.
     """
 
     name: str
     labels: tuple[str, ...] = ()
 
     def candidates(self) -> Sequence["FloorClassifier"]:
-        """Return variants with different settings, of which cross-validation picks one."""
+        """Return variants with different settings, from which cross-validation selects one."""
         return (self,)
 
     @abc.abstractmethod
@@ -124,7 +124,8 @@ class FloorClassifier(abc.ABC):
     def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         """Return the probability of each floor after every row of every run.
 
-        Each run starts anew. The belief after a row depends on that row and earlier ones only.
+        Each run is processed separately. The belief after a row depends on that row and earlier
+        ones only.
         """
 
     @property
@@ -185,7 +186,7 @@ def features(
 ) -> Features:
     """Return the features of every row from the rows up to it; NaN where a channel has no value.
 
-    After every `restart_s` [s], windows start anew without earlier rows, as at the start of a run.
+    After every `restart_s` [s], windows restart without earlier rows, as at the start of a run.
     """
     start = run.segment_start(restart_s)
     columns = [np.minimum(run.time - run.time[start], max(windows_s))]

@@ -1,11 +1,11 @@
 """Floor classifiers learned from window features: a Gaussian per floor, and boosted trees.
 
-Gaussian per floor. This is a simple baseline, which a practitioner writes in ten lines.
+Gaussian per floor. This is a simple baseline, which needs ten lines of code.
 
     x ~ N(m_floor, S_floor),   S_floor = (1 - a) (floor's covariance) + a (mean over all floors)
     log p_t = log p_{t-1} + (dt / apart) log N(x_t; m_floor, S_floor) + const
 
-x are the standardised features of a window; missing features count as the mean. p_t is the
+x are the standardised features of a window; missing features are replaced by the mean. p_t is the
 probability of a floor after row t, dt the duration of the row, `apart` the time between independent
 rows. a = 1 is linear discriminant analysis, a = 0 quadratic. Tuned by cross-validation: a.
 
@@ -76,8 +76,8 @@ if TYPE_CHECKING:
 
 LogLikelihood = Float[np.ndarray, "row floor"]
 LOWEST_PROBABILITY = 1e-4
-"""Lower limit of the probability of a floor that the trees give for one row."""
-DRIVING: frozenset[FloorChannel] = frozenset()
+"""Lower limit of the probability of a floor in one row."""
+SPEEDS_ONLY: frozenset[FloorChannel] = frozenset()
 """Wheel speeds alone, to learn floors from the driving style."""
 
 
@@ -228,7 +228,7 @@ class BoostedTreesClassifier(FloorClassifier):
         return [replace(self, leaves=n) for n in (4, 12)] if self.tuned else [self]
 
     def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "BoostedTreesClassifier":
-        channels = [self.channels, DRIVING] if self.without_driving else [self.channels]
+        channels = [self.channels, SPEEDS_ONLY] if self.without_driving else [self.channels]
         fitted = tuple(self._ensemble(runs, spec, each) for each in channels)
         return replace(self, labels=floors_of(runs), fitted=fitted)
 
@@ -279,6 +279,6 @@ def tree_classifiers() -> list[BoostedTreesClassifier]:
     return [
         trees,
         replace(fixed, name="boosted_trees_felt", without_driving=True),
-        replace(fixed, name="boosted_trees_driving", channels=DRIVING),
+        replace(fixed, name="boosted_trees_driving", channels=SPEEDS_ONLY),
         replace(fixed, name="boosted_trees_vibration", channels=DEFAULT_CHANNELS | {"vibration"}),
     ]

@@ -1,6 +1,6 @@
 """Inputs and targets of the learned methods, in windows of half a second.
 
-The inputs of a window are means over it of what the robot itself measures:
+The inputs of a window are means over the measurements of the robot itself:
 
     rolling twist (vx, vy, W), as if nothing slipped; speed of each drive
     direction (vx, vy, L W) / size, with size = |(vx, vy, L W)| and L the base radius,
@@ -68,7 +68,7 @@ class SignalWindows:
     Attributes:
         signals: signals of each run, averaged over its windows.
         rolling: body twist without slip.
-        size: size of the rolling twist [m/s]; a yaw rate counts as speed at the base radius.
+        size: size of the rolling twist [m/s], with the yaw rate multiplied by the base radius.
         run: index of the run of each window.
     """
 
@@ -161,7 +161,9 @@ class SlipExamples:
         channels, windows = common(runs), SignalWindows.of([run.signals for run in runs], spec)
         moving = windows.moving
         if not moving.any():
-            raise ValueError("no window of the runs has turning wheels; nothing to learn from")
+            raise ValueError(
+                "no window of the runs has turning wheels; expected runs in which the robot drives"
+            )
         size = windows.size[moving]
         true = np.concatenate([run.windowed().twist for run in runs])
         return cls(
@@ -198,7 +200,7 @@ class LearnedSlip(SlipModel, abc.ABC):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.regressor is None:
-            raise ValueError(f"{self.name}: predict before fit")
+            raise ValueError(f"{self.name} was not fitted; expected a call of fit before predict")
         windows = SignalWindows.of(runs, spec)
         with one_thread():
             ratio = self.regressor.predict(windows.inputs(spec, self.channels))
@@ -228,7 +230,7 @@ class Scale:
     def of(cls, x: Float[np.ndarray, "row column"]) -> "Scale":
         """Return the standardisation of the columns of these training rows."""
         std = x.std(axis=0)
-        # the computed std of a constant column is not zero but of the size of rounding errors
+        # The computed std of a constant column is not zero but of the size of rounding errors.
         flat = std <= 1e-9 * np.abs(x).max(axis=0)
         return cls(x.mean(axis=0), np.where(flat, 1.0, std), x.min(axis=0), x.max(axis=0))
 

@@ -89,7 +89,7 @@ class ProcessRows:
         from sklearn.exceptions import ConvergenceWarning
 
         with warnings.catch_warnings():
-            # a length scale at its upper bound only means that its input is irrelevant
+            # A length scale at its upper bound only means that its input is irrelevant.
             warnings.simplefilter("ignore", ConvergenceWarning)
             return self._fitted(kernel, MOST_TUNING_WINDOWS, _few_steps).kernel_
 

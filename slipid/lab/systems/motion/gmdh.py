@@ -160,7 +160,7 @@ class GmdhClass(SlipModel):
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhClass":
         data = SlipExamples.of(runs, spec)
         in_a = first_half(data.run, data.floor)
-        # a floor on which no wheel turned has no training windows
+        # A floor on which no wheel turned has no training windows.
         names = list(dict.fromkeys(data.floor.tolist()))
         on = np.stack([data.floor == name for name in names], axis=1)
         floors = {
@@ -180,7 +180,7 @@ class GmdhClass(SlipModel):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if not self.floors:
-            raise ValueError(f"{self.name}: predict before fit")
+            raise ValueError(f"{self.name} was not fitted; expected a call of fit before predict")
         windows, names = SignalWindows.of(runs, spec), list(self.floors)
         inputs = windows.inputs(spec, self.channels)
         belief = self._belief(windows, inputs, runs)
@@ -208,7 +208,7 @@ class GmdhClass(SlipModel):
             return np.ones((len(inputs), 1))
         share = self.classifier.predict(inputs).clip(min=LOWEST_OUTPUT)
         evidence = np.log(share / share.sum(axis=1, keepdims=True))
-        # signals of a robot at rest carry no evidence about its floor
+        # Signals of a robot at rest contain no evidence about its floor.
         evidence[~windows.moving] = 0.0
         possible = np.array([[run.load in loads for loads in self.loads] for run in runs])
         possible |= ~possible.any(axis=1, keepdims=True)

@@ -12,7 +12,7 @@ the training inputs, the output is that at the edge of the range.
 Tuned: the learning rate and the number of leaves of each of the sixty trees.
 
 Liberties of the trees:
-    - They are not a published slip system, but the obvious first method for tabular data.
+    - They are not a published slip system, but a standard method for tabular data.
     - Each component has its own trees; there is no shrinkage but the rate, and no early stopping.
     - Windows are drawn at random in proportion to their weight and then have equal weights.
 
@@ -155,7 +155,7 @@ class NeuralNetwork(LearnedSlip):
             random_state=SEED,
         )
         with warnings.catch_warnings():
-            # the number of passes is limited on purpose, so reaching the limit needs no warning
+            # The number of passes is limited on purpose, so reaching the limit needs no warning.
             warnings.simplefilter("ignore", ConvergenceWarning)
             x, y = inputs.scaled(examples.inputs), outputs.scaled(examples.ratio)
             network.fit(x, y, sample_weight=examples.weight)

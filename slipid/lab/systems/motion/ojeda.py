@@ -256,7 +256,7 @@ def by_gyro(steps: FlaggedSteps, w: TrainingWindows, middle: float, spec: RobotS
     """
     signals = steps.steps.signals
     if signals.gyro is None:
-        raise ValueError(f"{signals.name}: no gyro; this method needs one")
+        raise ValueError(f"{signals.name}: no gyro; expected one, which this method needs")
     parts = w.means(spec.back[2] @ steps.features(middle)) * w.dt[:, None]
     gap = w.means(signals.rolling(spec)[:, 2] - signals.gyro) * w.dt
     offset, gain = scaled_least_squares(parts, gap)

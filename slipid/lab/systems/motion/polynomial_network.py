@@ -26,9 +26,9 @@ from jaxtyping import Bool, Float, Int
 POWERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [2, 0], [0, 2]])
 """Exponents of the first and the second input in a neuron's terms."""
 LEAST_GAIN = 1e-3
-"""Smallest relative fall of the mean square error on B by a new layer; less may be chance."""
+"""Smallest relative decrease of the mean square error on B by a new layer; less may be chance."""
 ROUNDING = 1e-12
-"""Mean square error on B up to which it counts as rounding error, for outputs of variance one."""
+"""A mean square error on B up to this is taken as rounding error, for outputs of variance one."""
 
 
 @dataclass(frozen=True)

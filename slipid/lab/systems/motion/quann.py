@@ -124,7 +124,7 @@ class QuannEnergy(SlipModel):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.law is None or self.fastest is None:
-            raise ValueError(f"{self.name}: predict before fit")
+            raise ValueError(f"{self.name} was not fitted; expected a call of fit before predict")
         windows = SignalWindows.of(runs, spec)
         residual = self.process.predict(places(windows, spec))
         motion = np.minimum(motions(windows.rolling), self.fastest)
@@ -213,7 +213,7 @@ class QuannSlip(SlipModel):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.scale is None:
-            raise ValueError(f"{self.name}: predict before fit")
+            raise ValueError(f"{self.name} was not fitted; expected a call of fit before predict")
         windows = SignalWindows.of(runs, spec)
         inputs = self.scale.scaled(slip_inputs(windows, spec))
         ratio, ratio_std = self.process.predict(inputs, return_std=True)

@@ -78,7 +78,7 @@ from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
 from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise, SlipFilter
 from slipid.predict.slip_model import PredictedRun, RobotSpec, Run, RunSignals, SlipModel, path_of
 
-_STEADY = 10.0
+_STEADY_STEP_S = 10.0
 """Duration of the backward Euler step whose end counts as steady motion [s]."""
 _FIT_RUNS, _FIT_WINDOWS = 40, 100
 """Largest number of runs in a fit, and of windows in the fit of the force law."""
@@ -139,7 +139,7 @@ class PosedWindows:
     def steady(self, dynamics: Dynamics) -> DynamicsStep:
         """Return the steady speeds that the dynamics give for the rim speeds of every window."""
         rolling = np.full(len(self.dt), dynamics.law.rolling)
-        return dynamics.step(self.rolling, rolling, self.rim, np.full(len(self.dt), _STEADY))
+        return dynamics.step(self.rolling, rolling, self.rim, np.full(len(self.dt), _STEADY_STEP_S))
 
 
 def fitted_law(windows: PosedWindows, spec: RobotSpec, with_drag: bool) -> ForceLaw:

@@ -78,7 +78,7 @@ def test_a_missing_topic_is_answered_with_near_names_and_fitting_topics(tmp_path
     topics = {"wheel_angle": {"topic": "/joint_state"}}
     words = ("no topic '/joint_state' for wheel_angle", "did you mean /joint_states")
     refused(
-        tmp_path, messages, topics, *words, "one of /arm/states, /joint_states, which hold such"
+        tmp_path, messages, topics, *words, "one of /arm/states, /joint_states, which have such"
     )
 
 
@@ -88,7 +88,7 @@ def test_where_no_topic_fits_all_are_listed(tmp_path):
 
 def test_an_empty_topic(tmp_path):
     topics = {"gyro": {"topic": "/imu"}}
-    words = ("topic '/imu'", "no message", "holds gyro", "was its driver on?")
+    words = ("topic '/imu'", "no message", "topic of gyro", "was its driver on?")
     refused(tmp_path, wheels(), topics, *words, empty={"/imu": IMU})
 
 
@@ -108,8 +108,16 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
 @pytest.mark.parametrize(
     ("channel", "spec", "words"),
     [
-        ("gyro", {"topic": "/pose"}, (POSE, "the field of gyro is unknown", "sensor_msgs/Imu")),
-        ("pose", {"topic": "/imu"}, ("no pose of type", "TransformStamped", "field that holds it")),
+        (
+            "gyro",
+            {"topic": "/pose"},
+            (POSE, "field for gyro is not known", "sensor_msgs/Imu"),
+        ),
+        (
+            "pose",
+            {"topic": "/imu"},
+            ("no pose of type", "TransformStamped", "that contains it"),
+        ),
         ("twist_command", {"topic": "/pose"}, ("no twist_command", "geometry_msgs/Twist")),
         ("bus_voltage", {"topic": "/imu"}, ("BatteryState", "field = one of its numbers")),
         (
@@ -130,7 +138,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
         (
             "gyro",
             {"topic": "/imu", "field": "angular_velocity.z[2]"},
-            ("no numbers in angular_velocity.z[2]", "wanted index"),
+            ("no numbers in angular_velocity.z[2]", "requested index"),
         ),
         (
             "gyro",
@@ -145,7 +153,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
         (
             "wheel_speed",
             {"topic": "/joint_states", "field": "position"},
-            ("'rad' cannot be converted to rad/s", "belong to", "wheel_angle"),
+            ("'rad' cannot be converted to rad/s", "are possible for", "wheel_angle"),
         ),
         (
             "wheel_speed",
@@ -155,7 +163,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
         (
             "wheel_angle",
             {"topic": "/joint_states", "scale": [1.0, 1.0, -1.0]},
-            ("2 columns for 3 scales",),
+            ("2 columns, but 3 scales",),
         ),
         (
             "pose",
@@ -181,13 +189,21 @@ def test_odometry_is_no_command(tmp_path):
 
 def test_wrong_joint_names(tmp_path):
     topics = {"wheel_angle": {"topic": "/joint_states"}}
-    words = ("no joint 'wheel_lft'", "did you mean wheel_left", "there: wheel_left, wheel_right")
+    words = (
+        "no joint 'wheel_lft'",
+        "did you mean wheel_left",
+        "in the messages: wheel_left, wheel_right",
+    )
     refused(tmp_path, wheels(), topics, *words, joints=("wheel_lft", "wheel_right"))
 
 
 def test_no_joint_names(tmp_path):
     topics = {"wheel_angle": {"topic": "/joint_states"}}
-    words = ("no joints are named", "order of the drives", "there are: wheel_left, wheel_right")
+    words = (
+        "no joints are named",
+        "order of the drives",
+        "the messages have: wheel_left, wheel_right",
+    )
     refused(tmp_path, wheels(), topics, *words, joints=())
 
 
@@ -230,7 +246,7 @@ def test_an_array_that_changes_its_length(tmp_path):
         for k, t in enumerate(TIME.tolist())
     ]
     topics = {"current": {"topic": "/amps", "unit": "A"}}
-    refused(tmp_path, messages, topics, "message 18", "3 numbers, and 2 of them before")
+    refused(tmp_path, messages, topics, "message 18", "3 numbers, but 2 in earlier messages")
 
 
 # numbers
@@ -240,7 +256,7 @@ def test_poses_without_numbers(tmp_path):
     x = TIME - START
     x[40:60] = np.nan
     topics = {"pose": {"topic": "/pose"}}
-    words = ("message 41", "pose.position.x is nan", "20 such among 200", "drop_nan = true")
+    words = ("message 41", "pose.position.x is nan", "20 such values among 200", "drop_nan = true")
     refused(tmp_path, poses(x=x), topics, *words)
     run = accepted(tmp_path / "kept", poses(x=x), topics, drop_nan=True)
     assert len(run.signals["pose_x"].time) == 180
@@ -249,7 +265,7 @@ def test_poses_without_numbers(tmp_path):
 
 def test_all_poses_without_numbers(tmp_path):
     topics = {"pose": {"topic": "/pose"}}
-    words = ("200 such among 200", "does the driver fill")
+    words = ("200 such values among 200", "does the driver fill")
     refused(tmp_path, poses(x=np.full(len(TIME), np.nan)), topics, *words, drop_nan=True)
 
 
@@ -304,7 +320,7 @@ def test_of_messages_with_one_stamp_the_last_stands(tmp_path):
     stamps[50] = stamps[49]
     run = accepted(tmp_path, imu(stamps=stamps), {"gyro": {"topic": "/imu"}})
     assert run.signals["gyro"].source.lines[48:51].tolist() == [49, 51, 52]
-    assert "1 messages with the stamp of another left out" in run.notes[0]
+    assert "1 messages with the same stamp as another were left out" in run.notes[0]
 
 
 @pytest.mark.parametrize(("apart", "notes"), [(0.2, 0), (3.0, 1)])
@@ -338,7 +354,7 @@ def test_a_definition_that_is_nowhere(tmp_path):
         runs_of(path, declared_bag_layout({"topics": topics}, "layout"))
     (tmp_path / "Amps.msg").write_text("my_msgs/Inner inner\n")
     given = {"topics": topics, "definitions": str(tmp_path)}
-    with pytest.raises(DataError, match=r"Inner, which my_msgs/msg/Amps is made of.* no Inner.msg"):
+    with pytest.raises(DataError, match=r"Inner, which my_msgs/msg/Amps contains.* no Inner.msg"):
         runs_of(path, declared_bag_layout(given, "layout"))
     (tmp_path / "Inner.msg").write_text("float64 x\n")
     with pytest.raises(DataError, match=r"topic '/amps' message 1: it is no my_msgs/msg/Amps"):

@@ -82,5 +82,5 @@ def test_what_effort_may_mean(tmp_path, channel, unit, factor):
 
 def test_a_torque_needs_what_makes_a_current_of_it():
     topics = {"motor_torque": {"topic": "/joint_states", "field": "effort", "unit": "N*m"}}
-    with pytest.raises(DataError, match="a torque without torque_constant"):
+    with pytest.raises(DataError, match="a torque channel without torque_constant"):
         layout(topics=topics)

@@ -129,7 +129,7 @@ def test_a_table_of_stamps(tmp_path):
     (tmp_path / "runs.csv").write_text(f"start,end\n{START + 1},{START + 8}\n1,2\n")
     found = runs(tmp_path, {"table": "runs.csv"})
     assert spans(found) == [("", 1.0, 7.98)]
-    assert "1 runs left out" in found[0].notes[0]
+    assert "1 runs without samples" in found[0].notes[0]
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_a_frame_that_lies_on_its_side_is_noted(tmp_path):
     [
         ("map", "bse", ("no frame 'bse'", "did you mean base", "camera", "odom")),
         ("map", "other", ("no transforms lead from 'map' to 'other'", "elsewhere -> other")),
-        ("base", "camera", ("there once", "frames that move")),
+        ("base", "camera", ("published only once", "frames that move")),
     ],
 )
 def test_frames_that_do_not_lead_there(tmp_path, parts, frame, child, words):

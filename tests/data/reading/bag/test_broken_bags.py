@@ -126,7 +126,7 @@ def test_an_mcap_file_is_read_up_to_its_last_whole_record(tmp_path, whole):
     np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
     np.testing.assert_allclose(run.signals["pose_x"].values[:, 0], TIME)
     assert "was cut off" in run.notes[0]
-    assert "last whole record" in run.notes[0]
+    assert "last complete record" in run.notes[0]
     assert {topic.name for topic in topics_of(file)} == {"/joint_states", "/tf", "/camera"}
 
 

@@ -16,7 +16,7 @@ from slipid.lab.systems.floors.cosine_energy import (
 )
 from slipid.lab.systems.floors.interface import training_rows
 from slipid.lab.systems.floors.learned import (
-    DRIVING,
+    SPEEDS_ONLY,
     BoostedTreesClassifier,
     GaussianClassifier,
     features,
@@ -138,7 +138,7 @@ def test_rows_of_trees_use_the_channels_of_their_names():
         "boosted_trees_vibration",
     ]
     assert plain.channels == off.channels == {"current", "gyro"}
-    assert driving.channels == DRIVING == set()
+    assert driving.channels == SPEEDS_ONLY == set()
     assert vibration.channels == {"current", "gyro", "vibration"}
     assert off.without_driving
     assert not plain.without_driving

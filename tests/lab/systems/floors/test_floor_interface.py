@@ -13,7 +13,7 @@ from slipid.lab.systems.floors.interface import (
     training_rows,
 )
 from slipid.lab.systems.floors.learned import (
-    DRIVING,
+    SPEEDS_ONLY,
     BoostedTreesClassifier,
     GaussianClassifier,
     features,
@@ -96,7 +96,7 @@ def test_windows_leave_out_missing_values():
 def test_features_are_of_the_requested_channels():
     run = made_floor_run("grass", ahead(20), 2.0)
     other = replace(run, current=run.current + 1.0)
-    driving = DRIVING
+    driving = SPEEDS_ONLY
     same = features(run, HUSKY, driving), features(other, HUSKY, driving)
     assert np.array_equal(*same)
     assert not np.array_equal(features(run, HUSKY), features(other, HUSKY))

@@ -270,5 +270,5 @@ def test_one_set_of_networks_does_not_ask_for_the_floor(classes):
 def test_settings_that_are_tried(method):
     assert [each.growth for each in method.candidates()] == list(CANDIDATES)
     assert method.numbers == 0
-    with pytest.raises(ValueError, match="before fit"):
+    with pytest.raises(ValueError, match="was not fitted"):
         method.predict([RUNS[0].signals], ROBOTINO)

@@ -274,5 +274,5 @@ def test_a_map_knows_places_that_cost_more():
 @pytest.mark.parametrize("method", [QuannSlip(), QuannEnergy()], ids=lambda method: method.name)
 def test_nothing_is_predicted_before_a_fit(method):
     assert method.numbers == 0
-    with pytest.raises(ValueError, match="before fit"):
+    with pytest.raises(ValueError, match="was not fitted"):
         method.predict([made_run(straight(0.0)).signals], ROBOTINO)

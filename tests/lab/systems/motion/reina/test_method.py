@@ -60,7 +60,7 @@ def test_without_other_signs_the_area_is_that_of_the_currents_themselves():
     score = np.concatenate([one.slipping for one in predicted if one.slipping is not None])
     truth = np.concatenate([slipping(run) for run in steady])
     amps = np.concatenate([SmoothedSignals.of(r.signals, ROBOTINO, 1e-3).amps for r in steady])
-    raised = np.maximum(amps - method.limits.usual, 0.0)
+    raised = np.maximum(amps - method.limits.current_low, 0.0)
     assert 0.6 < roc_auc_score(truth, score) < 0.97
     assert roc_auc_score(truth, score.round(6)) == pytest.approx(
         roc_auc_score(truth, raised.round(6))
