@@ -327,13 +327,16 @@ def test_a_changed_digit_is_refused(path):
             "draws['surface.soft.frict",
         ),
         (lambda c: c["draws"].update(mass=[1]), "'mass': not a parameter"),
-        (lambda c: c["units"].update(alike="m"), "other units"),
+        (lambda c: c["units"].update(alike="m"), "its units differ from those of slipid.robot/6"),
         (lambda c: c["gains"]["values"].pop("yaw"), "gains.values.yaw is missing"),
         (
             lambda c: c.update(loads=c["loads"][:1] * 2),
             "expected at least one name, and each only once",
         ),
-        (lambda c: c.update(floors=[]), "floors []; expected one or more"),
+        (
+            lambda c: c.update(floors=[]),
+            "floors []; expected at least one name, and each only once",
+        ),
     ],
 )
 def test_missing_and_wrong_fields_are_named(path, change, said):
