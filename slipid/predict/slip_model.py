@@ -187,10 +187,11 @@ class RunSignals:
         return np.asarray(self.current * np.sign(self.speed) if signed else self.current)
 
     def torque(self, spec: RobotSpec, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
-        """Return M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 `rest`.
+        """Return the torque characterising variable M of the 2021 paper [N m].
 
-        It is the 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I,
-        made finite at rest by w0. It is positive if the motor drives the wheel.
+        M = U I / w with the voltage U = C_e w + R I, the current I and the shaft speed w. It is
+        computed as C_e I + R I^2 w / (w^2 + w0^2), which is finite at rest, with w0 = `rest`. It is
+        positive if the motor drives the wheel.
         """
         amps, shaft = self.along(spec), np.abs(spec.gear_ratio * self.speed)
         heat = spec.resistance * amps**2 * shaft / (shaft**2 + rest**2)
