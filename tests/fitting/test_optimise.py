@@ -303,15 +303,15 @@ def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fi
 def test_steps_of_the_solver_go_down_the_valley_of_rosenbrock(monkeypatch):
     """A function whose first undamped steps go uphill; each accepted step must lower it."""
 
-    def residuals(fixed, y):
+    def residuals(fixed, y, near=None):
         a, b = fixed.z + y
         return LinearisedResiduals(
-            np.array([10 * (b - a**2), 1 - a]), np.array([[-20 * a, 10.0], [-1.0, 0.0]])
+            np.array([10 * (b - a**2), 1 - a]), np.array([[-20 * a, 10.0], [-1.0, 0.0]]), near
         )
 
     monkeypatch.setattr("slipid.fitting.optimise.linearised", residuals)
     fixed = SimpleNamespace(z=np.array([-1.2, 1.0]), mask=np.ones(2), prior_std=np.ones(2))
-    ends = [levenberg(fixed, steps) for steps in range(1, 40)]
+    ends = [levenberg(fixed, None, steps)[0] for steps in range(1, 40)]
     losses = [residuals(fixed, end - fixed.z).loss for end in ends]
     assert losses[0] < residuals(fixed, np.zeros(2)).loss
     assert all(b < a or a < 1e-15 for a, b in pairwise(losses))
