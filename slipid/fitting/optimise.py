@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -134,7 +135,8 @@ def one_round(
         motor_force=start.motor_force,
         slope=log_jacobian(objective, state.z, electric, keep)[1],
     )
-    z, near = levenberg(fixed, start.twists, steps)
+    y, near = levenberg(partial(linearised, fixed), len(state.z), start.twists, steps)
+    z = np.asarray(_at(fixed, y))
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force, near = linear(objective, jnp.asarray(z), electric, near)
     effect = effects_given(weighed.effects, root["motion"], whole["motion"])
@@ -285,28 +287,32 @@ class LinearisedResiduals(NamedTuple):
         return 0.5 * float(self.residual @ self.residual)
 
 
-def levenberg(fixed: RoundInputs, near: Twists, steps: int) -> tuple[Search, Twists]:
-    """Return the search vector after steps of the Levenberg-Marquardt method, and its twists.
+def levenberg(
+    linearised: Callable[[Search, Twists], LinearisedResiduals], size: int, near: Twists, steps: int
+) -> tuple[Search, Twists]:
+    """Return the vector after steps of the Levenberg-Marquardt method from zero, and its twists.
 
-    The whitening is fixed. A step is accepted if it lowers the loss by at least 1 % of what the
-    linear model predicts, and the damping then falls if the model is right to 1 %; it rises after a
-    refused step. Refused steps do not count: each makes the next one smaller, so that a round that
-    stopped after refused steps would look like convergence.
+    A step is accepted if it lowers the loss by at least 1 % of what the linear model predicts, and
+    the damping then falls if the model is right to 1 %; it rises after a refused step. Refused
+    steps do not count: each makes the next one smaller, so that a round that stopped after refused
+    steps would look like convergence.
 
     The loop is not compiled: it takes no time beside the Jacobians, while its compilation would
     take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for the constants.
 
     Args:
-        near: twists at the start.
+        linearised: function that returns the residuals at a vector, given twists near its own.
+        size: number of coordinates of the vector.
+        near: twists near those at zero.
         steps: largest number of accepted steps.
     """
-    y = np.zeros(len(fixed.z))
-    at, length, accepted = linearised(fixed, y, near), 1.0, 0
+    y = np.zeros(size)
+    at, length, accepted = linearised(y, near), 1.0, 0
     for _ in range(steps + _MOST_REFUSED - 1):
         a = at.jacobian.T @ at.jacobian + np.eye(len(y)) / length
         step = -np.linalg.solve(a, at.jacobian.T @ at.residual)
         predicted = at._replace(residual=at.residual + at.jacobian @ step).loss - at.loss
-        new = linearised(fixed, y + step, at.twists)
+        new = linearised(y + step, at.twists)
         if not new.loss - at.loss <= 0.01 * predicted:
             length *= 0.25
             continue
@@ -315,7 +321,7 @@ def levenberg(fixed: RoundInputs, near: Twists, steps: int) -> tuple[Search, Twi
         y, at, accepted = y + step, new, accepted + 1
         if settled or accepted >= steps:
             break
-    return np.asarray(_at(fixed, y)), at.twists
+    return y, at.twists
 
 
 def _alike(new: np.ndarray, old: np.ndarray) -> bool:

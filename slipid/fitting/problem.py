@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
@@ -328,9 +328,9 @@ class Twists(NamedTuple):
         electric: the same with the electric numbers of `GivenMotion` replaced.
     """
 
-    steady: lk.Marker | Float[np.ndarray, "segment window 3"]
-    multi_floor: lk.Marker | Float[np.ndarray, "segment window 3"] | None
-    electric: lk.Marker | Float[np.ndarray, "segment window 3"] | None
+    steady: lk.NearTwists
+    multi_floor: lk.NearTwists | None
+    electric: lk.NearTwists | None
 
     @classmethod
     def unknown(cls, objective: Objective) -> "Twists":
@@ -401,8 +401,46 @@ def linear_given(
             twists = Twists(p.twist, mine.twist, theirs.twist)
         return out, Linearised(out, {}, force, twists)
 
-    jacobian, found = jax.jacfwd(blocks, has_aux=True)(z)
-    return found._replace(jacobian=jacobian)
+    direction = np.arange(space.size) if objective.multi_floor else _directions(space)
+
+    def along(change: Array) -> tuple[Blocks, Linearised]:
+        return jax.jvp(blocks, (jnp.asarray(z),), (change,), has_aux=True)[1:]
+
+    changes = (np.arange(direction.max(initial=-1) + 1)[:, None] == direction).astype(float)
+    slopes, found = jax.vmap(along, out_axes=(-1, None))(changes)
+    if not objective.multi_floor:
+        concerns = _concerns(space, batch)[:, None]
+        slopes = {k: jnp.where(concerns, s[..., direction], 0.0) for k, s in slopes.items()}
+    return found._replace(jacobian=slopes)
+
+
+def _directions(space: Space) -> Int[np.ndarray, " free"]:
+    """Return the index of the direction in which the derivative is taken for each coordinate.
+
+    A segment is on one floor, with one load set-up, in one session. Coordinates that differ only in
+    these are changed together: for each segment, the derivative is that of the one coordinate that
+    concerns it. Source: Curtis, Powell and Reid 1974, IMA J. Appl. Math. 13(1).
+    """
+    of = [(e.quantity, k) for e in space.free for k in range(e.coordinates)]
+    index = {key: number for number, key in enumerate(dict.fromkeys(of))}
+    return np.array([index[key] for key in of], int)
+
+
+def _concerns(space: Space, batch: lk.Batch) -> Bool[Array, "segment free"]:
+    """Return True for the coordinates of a segment's floor, load set-up, session, or of all."""
+    tree = space.template
+    out = jnp.ones((len(batch.surface), space.size), bool)
+    for label, names, of in (
+        ("surface", tree.surfaces.labels, batch.surface),
+        ("load", tree.body.loads, batch.load),
+        ("session", tree.camera.sessions, batch.session),
+    ):
+        mine = np.repeat(
+            [names.index(getattr(e, label)) if getattr(e, label) else -2 for e in space.free],
+            [e.coordinates for e in space.free],
+        )
+        out &= (mine == -2) | (mine == of[:, None])
+    return out
 
 
 @eqx.filter_jit
