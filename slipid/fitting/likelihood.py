@@ -1,6 +1,7 @@
-"""Predictions of a robot for every segment of every run, and their residuals to the measurements.
+"""Predictions of a robot model for every segment of every run, and their residuals.
 
-A segment is a few neighbouring windows of one run. The weighting of residuals is in `noise`.
+A segment is a few neighbouring windows of one run. A residual is the prediction less the
+measurement. `slipid.fitting.noise` weights the residuals.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +31,7 @@ Std = Float[Array, ""] | float
 SMOOTHING_A = 0.03
 """Current magnitude below which the prediction of an unsigned current is smoothed [A]."""
 ROUNDING_VARIANCE = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
-"""Variance added to every residual for the rounding of the logs, by the kind of residual.
+"""Variance added to every residual for the rounding of the logs, keyed by the kind of residual.
 
 `motion` [m^2] or [rad^2], `current` [A^2], `voltage` [V^2]."""
 
@@ -38,7 +39,7 @@ _AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "cur
 
 
 def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
-    """Return the value of function `of` at vector z and its derivative by z, evaluated together."""
+    """Return the value of function `of` at vector z, and its derivative with respect to z."""
     slope, value = jax.jacfwd(lambda x: (of(x),) * 2, has_aux=True)(z)
     return value, slope
 
@@ -46,7 +47,7 @@ def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Arr
 class Batch(eqx.Module):
     """Windows as arrays for compiled functions; names of floors, loads and sessions are indices.
 
-    The indices are those of the robot's stacked numbers. `surface` holds the floor under the whole
+    The indices refer to the robot's stacked parameters. `surface` holds the floor under the whole
     robot (segment,), or under each of its wheels in every window (segment, window, wheel). The
     other fields are those of `slipid.data.windows.Windows`.
     """
@@ -101,8 +102,8 @@ class ElectricNoise(eqx.Module):
         scatter: variance of the true current of every window around the predicted current [A^2],
             without the ammeter's noise.
         resistance: winding resistance R [ohm], which converts the uncertainty of the true current
-            to a voltage. It is fixed during every round of a fit, as the variances are: these are
-            fitted to the size of the residuals, which therefore has no further information about R.
+            to a voltage. It stays fixed during a round of a fit, as the variances do: the variances
+            are fitted to the size of the residuals, so that this size cannot inform about R too.
     """
 
     voltage_std: Std
@@ -218,9 +219,8 @@ def marker_increments(
 @eqx.filter_jit
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
     """Return the predicted motor current of every window [A]; its magnitude for unsigned logs."""
-    friction = robot.surfaces.friction[
-        b.surface
-    ]  # Forces are divided by mu m g averaged over the wheels.
+    # `motor_force` is in units of mu m g with mu averaged over the wheels; `weight` is that unit.
+    friction = robot.surfaces.friction[b.surface]
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * GRAVITY
     torque = (
@@ -260,8 +260,8 @@ def electric_residuals(
     """Return predicted less measured `current` [A] and `voltage`, as far as they are logged.
 
     The voltage residual [V] is divided by `voltage_spread`. Voltages are predicted from the
-    expected true current, given the measured and the predicted current. If the measured current
-    were used alone, its noise would bias R towards small values.
+    expected true current, given the measured and the predicted current. If only the measured
+    current were used, its noise would bias R towards small values.
     """
     if not b.has_current:
         return {}
@@ -288,7 +288,7 @@ def _direction(b: Batch) -> PerDrive:
 
 
 def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
-    """Return the regression factor k from measured to true current, and the variance that remains.
+    """Return the regression factor k from measured to true current, and the remaining variance.
 
     The true current is N(predicted, s^2) before it is measured with noise of variance sigma^2.
     After the measurement it is N(predicted + k (measured - predicted), k sigma^2) with
@@ -304,9 +304,9 @@ def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDr
 def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, Array]:
     """Return log |d residuals / d data| of motion and of voltages, one value per segment each.
 
-    Both depend on fitted numbers: measured positions are corrected by the camera model, and voltage
-    residuals are divided by `voltage_spread`. Without these terms of the likelihood, numbers that
-    shrink the residuals would seem to fit better.
+    Both depend on fitted parameters: measured positions are corrected by the camera model, and
+    voltage residuals are divided by `voltage_spread`. Without these terms, the likelihood would
+    rise for parameter values that merely shrink all residuals, such as a small camera scale.
     """
     camera = camera_log_jacobian(robot, b.pose)
     if not (b.has_current and b.has_voltage):
@@ -318,7 +318,7 @@ def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, 
 def camera_log_jacobian(
     robot: Robot, pose: Float[Array, "segment edge 3"]
 ) -> Float[Array, " segment"]:
-    """Return log |d motion residuals / d logged poses| of every segment, its first pose fixed."""
+    """Return log |d motion residuals / d logged poses| of segments whose first pose is fixed."""
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
