@@ -144,15 +144,15 @@ class Standing(eqx.Module):
     motor: Motor
     mass: Float[Array, ""]
 
-    def twist(
-        self, wheel_speed: Float[Array, " wheel"], near: Float[Array, "3"] | None = None
-    ) -> Float[Array, "3"]:
-        """Return the body twist at given wheel speeds [rad/s] (vx, vy [m/s], yaw rate [rad/s]).
-
-        `near` is as in `contact.equilibrium`.
-        """
+    def contact(self, wheel_speed: Float[Array, " wheel"]) -> contact.ContactProblem:
+        """Return the contact problem at given wheel speeds [rad/s]."""
         rim = self.frame.radius * wheel_speed
-        return contact.equilibrium(rim, self.frame, self.floor, self.rest, near)
+        return contact.ContactProblem(rim, self.frame, self.floor, self.rest)
+
+    def twist(self, wheel_speed: Float[Array, " wheel"]) -> Float[Array, "3"]:
+        """Return the body twist at given wheel speeds [rad/s] (vx, vy [m/s], yaw rate [rad/s])."""
+        rim = self.frame.radius * wheel_speed
+        return contact.equilibrium(rim, self.frame, self.floor, self.rest)
 
     def motor_forces(
         self, xi: Float[Array, "3"], wheel_speed: Float[Array, " wheel"]
@@ -164,8 +164,8 @@ class Standing(eqx.Module):
         have. The rolling drag exerts no force on the body.
         """
         on = stand(self.frame, self.floor, self.rest)
-        balance, at = Balance(self.frame.radius * wheel_speed, on), Planar(*xi)
-        return jnp.stack([balance.motor_force(at), balance.rolling_drag(at)], axis=-1)
+        at = Balance(self.frame.radius * wheel_speed, on).at(Planar(*xi))
+        return jnp.stack([at.motor_force, at.rolling_drag], axis=-1)
 
     @property
     def lever(self) -> Float[Array, ""]:

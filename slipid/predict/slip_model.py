@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from slipid.data.wheel_signals import body_steps
 from slipid.data.windows import Windows
-from slipid.fitting.likelihood import marker_increments, measured_increments
+from slipid.fitting.likelihood import indices, marker_increments, measured_increments
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 
@@ -24,7 +24,7 @@ Increments = Float[np.ndarray, "segment window 3"]
 
 def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
     """Return marker increments [m, m, rad] of body twists (segment, window, 3)."""
-    session = jnp.asarray([robot.session_index(s) for s in w.session])
+    session = jnp.asarray(indices(robot.session_index, w.session))
     return np.asarray(marker_increments(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
 
 
