@@ -148,7 +148,8 @@ def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "segment time wh
     """
     edges = np.asarray(lk.corrected(robot, jnp.asarray(w.pose)))
     pose = np.stack([edges[:, 0], edges.mean(axis=1), edges[:, 1]], axis=1)
-    yaw = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])
+    session = lk.indices(robot.session_index, w.session)
+    yaw = np.asarray(jax.vmap(robot.camera.yaw)(jnp.asarray(session)))
     heading = pose[..., 2] - yaw[:, None]
     c, s = np.cos(heading), np.sin(heading)
     turn = np.stack([c, -s, s, c], -1).reshape(*c.shape, 2, 2)

@@ -22,7 +22,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.windows import Windows
-from slipid.fitting.likelihood import ROUNDING_VARIANCE, Batch, ElectricNoise, voltage_std
+from slipid.fitting.likelihood import (
+    ROUNDING_VARIANCE,
+    Batch,
+    ElectricNoise,
+    indices,
+    voltage_std,
+)
 from slipid.fitting.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION, MultiFloorRuns
 from slipid.model.robot import Robot
 
@@ -141,7 +147,7 @@ def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = N
         for floor in several_sessions if kind == "session" else floors:
             table += [Component(kind, what, floor, u, part * v) for what, u, v in _EFFECT]
     table.append(Component("pooled", "load_bias", None, "1", 0.05))
-    on = np.array([[robot.surface_index(s)] for s in windows.surface])
+    on = indices(robot.surface_index, windows.surface)[:, None]
     blocks = {"motion": _motion_components(windows, robot, 2 + 6 * on)}
     if multi_floor is not None:
         table += _multi_floor_components(multi_floor, robot, len(windows), len(table), blocks)

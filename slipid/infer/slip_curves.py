@@ -82,7 +82,7 @@ def torque_of_slip(
 
     def one(floor: ContactSurface, speed: Array) -> Array:
         rim = radius * speed
-        traction = law.wheel_traction(jnp.asarray(_SLIP) * rim, rim, floor).force()
+        traction = law.wheel_traction(jnp.asarray(_SLIP) * rim, rim, floor).force
         return radius * weight * law.load_force(jnp.asarray(share), floor) * traction
 
     return jax.vmap(one)(robot.surfaces, wheel_speed)

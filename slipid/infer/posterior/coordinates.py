@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
@@ -140,15 +139,8 @@ class Anchor(eqx.Module):
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:
-        """Return a robot's prediction; the search for twists starts near those of the fit.
-
-        If a search does not converge from there, all searches start from their default instead.
-        """
-        b = self.batch
-        start = self.twist + self.twist_slope @ (z - self.z)
-        p = lk.predict(robot, b, jax.lax.stop_gradient(start))
-        arrived = jnp.all(jnp.isfinite(p.twist))
-        return jax.lax.cond(arrived, lambda: p, lambda: lk.predict(robot, b))
+        """Return a robot's prediction; the search for twists starts near those of the fit."""
+        return lk.predict(robot, self.batch, self.twist + self.twist_slope @ (z - self.z))
 
     def noise(self, robot: Robot) -> lk.ElectricNoise:
         """Return the noise that predictions of voltages depend on, with a robot's resistance."""

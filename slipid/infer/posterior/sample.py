@@ -114,7 +114,7 @@ def drawn_variances(
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
-    residual, jacobian, motor_force = linear(problem.objective, fitted.z, electric)
+    residual, jacobian, motor_force, _ = linear(problem.objective, fitted.z, electric)
     through = problem.voltage_information(fitted.z, log_v, motor_force)
     effect = effects_at(problem, residual, log_v)
     weight = problem.weighed(residual, log_v, keep, effect).whitening.weight["motion"]
