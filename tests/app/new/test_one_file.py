@@ -19,7 +19,7 @@ def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     table(tmp_path / "grass" / "run2.csv", plain(9.0))
     draft, config = proposed(tmp_path, **ROBOT)
     (question,) = config.questions  # what no log without voltages tells
-    assert question.startswith('"motor.resistance": without the voltages')
+    assert question.startswith('"motor.resistance": no motor voltages')
     assert config.text.replace('"# ?"', "").count(QUESTION_MARK) == 1
     layout = layout_in(config)
     assert layout["columns"]["wheel_speed"] == {
