@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from slipid.data.wheel_signals import body_steps
 from slipid.data.windows import Windows
-from slipid.fitting.likelihood import marker_increments, measured_increments
+from slipid.fitting.likelihood import indices, marker_increments, measured_increments
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 
@@ -24,7 +24,7 @@ Increments = Float[np.ndarray, "segment window 3"]
 
 def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
     """Return marker increments [m, m, rad] of body twists (segment, window, 3)."""
-    session = jnp.asarray([robot.session_index(s) for s in w.session])
+    session = jnp.asarray(indices(robot.session_index, w.session))
     return np.asarray(marker_increments(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
 
 
@@ -187,10 +187,11 @@ class RunSignals:
         return np.asarray(self.current * np.sign(self.speed) if signed else self.current)
 
     def torque(self, spec: RobotSpec, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
-        """Return M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 `rest`.
+        """Return the torque characterising variable M of the 2021 paper [N m].
 
-        It is the 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I,
-        made finite at rest by w0. It is positive if the motor drives the wheel.
+        M = U I / w with the voltage U = C_e w + R I, the current I and the shaft speed w. It is
+        computed as C_e I + R I^2 w / (w^2 + w0^2), which is finite at rest, with w0 = `rest`. It is
+        positive if the motor drives the wheel.
         """
         amps, shaft = self.along(spec), np.abs(spec.gear_ratio * self.speed)
         heat = spec.resistance * amps**2 * shaft / (shaft**2 + rest**2)

@@ -262,7 +262,7 @@ def test_a_profile_of_what_is_not_fitted_is_2_before_the_fit(small, tmp_path):
     words = ("--data", folder / "logs", "--out", tmp_path / "out", "--profile", "robot.mass")
     result = invoke("identify", folder / "my.toml", *words)
     assert result.exit_code == 2
-    assert "--profile: robot.mass is fixed; expected one free number" in result.stderr
+    assert "--profile: robot.mass is fixed; expected one of the free scalars" in result.stderr
     assert not (tmp_path / "out").exists()
 
 
