@@ -417,7 +417,7 @@ def test_mistakes_with_maps_are_named(folder, change, expected):
 def test_every_floor_of_a_map_needs_runs_of_its_own(folder):
     path = folder / "maps/site.toml"
     path.write_text(MAP.replace("gray", "sand"), encoding="utf-8")
-    with pytest.raises(DataError, match=r"site\.toml: surface 'sand'.*expected some of gray"):
+    with pytest.raises(DataError, match=r"site\.toml: surface 'sand'.*expected one of gray"):
         mixed_job(folder, GOOD.replace("[parameters]", SITE))
 
 
