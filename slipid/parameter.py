@@ -1,10 +1,10 @@
-"""Fitted numbers with a name, a unit, bounds and a prior, and their map to the search space.
+"""Declared parameters with name, unit, bounds and prior, and their map to the search space.
 
-A class declares its numbers where its equations are:
+A class declares its parameters where its equations are:
 
     resistance: Array = parameter("ohm", "R", "of a winding", lower=0.1, upper=50.0, start=1.0)
 
-`entries` lists every declared number of a tree of such classes by its path name.
+`entries` lists every declared parameter of a tree of such objects, with its path name.
 """
 
 import dataclasses
@@ -20,31 +20,30 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Numbers = Array | np.ndarray
-"""Arrays of jax (traced or on a device) or of numpy, for which nothing is compiled."""
+"""JAX array (traced or on a device), or NumPy array, for which JAX compiles nothing."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Declaration:
-    """Unit, bounds and prior of a number, which are the same for all its occurrences.
+    """Unit, bounds and prior of a parameter, the same on all floors, load set-ups and sessions.
 
     Attributes:
         unit: unit in the notation of pint, "1" for a dimensionless number.
         symbol: symbol in the equations.
         start: value that is used if nothing else is known [unit].
-        lower: smallest value; without `upper` the search space is the logarithm of the excess over
-            it.
-        upper: largest value; with both bounds the search space is the log-odds of the relative
-            position between them.
+        lower: lower bound; without `upper`, the search space is the logarithm of value - lower.
+        upper: upper bound; with both bounds, the search space is the log-odds of
+            (value - lower) / (upper - lower).
         spread: default std of the prior in the search space: a log-std if the space is logarithmic,
             in [unit] if there are no bounds.
-        free: True if the number is fitted unless the user says otherwise.
-        shares: True if the numbers of the array are positive and sum to one.
-        deviation: True if the numbers of the array sum to zero and represent effects missing in the
-            model; their common spread is estimated from the data, up to about `spread`.
-        doc: meaning of the number, in one line.
-        electric: True if the number is estimated from currents and voltages given the motion, not
-            from the motion.
-        of: object to which each number of a vector belongs: a wheel, a drive or an axis.
+        free: True if the parameter is fitted unless the user says otherwise.
+        shares: True if the elements of the array are positive fractions that sum to one.
+        deviation: True if the elements of the array sum to zero and represent effects missing in
+            the model; their common std is estimated from the data, up to about `spread`.
+        doc: meaning of the parameter, in one line.
+        electric: True if the parameter is estimated from currents and voltages given the motion,
+            not from the motion.
+        of: object to which each element of a vector belongs: a wheel, a drive or an axis.
     """
 
     unit: str
@@ -62,20 +61,21 @@ class Declaration:
 
     @property
     def logarithmic(self) -> bool:
-        """True if the search space is logarithmic."""
+        """True if the search space is logarithmic: there is a lower bound, but no upper one."""
         return math.isinf(self.upper) and not math.isinf(self.lower)
 
     @property
     def constrained(self) -> bool:
-        """True if the array has one search-space coordinate less than it has numbers."""
+        """True if the sum of the elements is given, so that n of them have n - 1 coordinates."""
         return self.shares or self.deviation
 
     def broken_rule(self, x: np.ndarray) -> str | None:
-        """Return the rule that numbers break, as text, or None if they keep all rules."""
+        """Return the rule that the values `x` break, as text, or None if they are valid."""
         if self.deviation:
             kept, rule = abs(x.sum()) < 1e-6, "numbers that sum to 0"
         elif self.shares:
-            kept, rule = (x > 0).all() & (abs(x.sum() - 1) < 1e-6), "positive shares that sum to 1"
+            kept = (x > 0).all() & (abs(x.sum() - 1) < 1e-6)
+            rule = "positive fractions that sum to 1"
         else:
             kept = ((x > self.lower) & (x < self.upper)).all()
             rule = f"inside ({self.lower:g}, {self.upper:g}) {self.unit}"
@@ -94,7 +94,10 @@ class Declaration:
         return np.log(p) - np.log1p(-p)
 
     def to_si(self, z: Float[Numbers, "*some n"]) -> Float[Numbers, "*some m"]:
-        """Return the SI values of one or many search-space vectors; numpy input is not compiled."""
+        """Return the SI values of one or many search-space vectors.
+
+        JAX compiles nothing if `z` is a NumPy array.
+        """
         if self.constrained:
             x: Numbers = z @ share_basis(z.shape[-1] + 1).T
             return _softmax(x) if self.shares else x
@@ -105,7 +108,7 @@ class Declaration:
         return self.lower + (self.upper - self.lower) * _sigmoid(z)
 
     def slope(self, value: Any) -> Any:
-        """Return d SI / d search at SI values; the numbers must not be constrained."""
+        """Return d (SI value) / d (search coordinate) at SI values, if not `constrained`."""
         if math.isinf(self.lower) and math.isinf(self.upper):
             return np.ones_like(value)
         if math.isinf(self.upper):
@@ -129,7 +132,7 @@ def _sigmoid(z: Numbers) -> Numbers:
 
 
 def share_basis(n: int) -> np.ndarray:
-    """Return an orthonormal basis (n, n-1) of the vectors that sum to zero (Helmert)."""
+    """Return an orthonormal basis (n, n-1) of the vectors whose elements sum to 0 (Helmert)."""
     basis = np.zeros((n, n - 1))
     for k in range(1, n):
         basis[:k, k - 1] = 1.0
@@ -141,11 +144,11 @@ def share_basis(n: int) -> np.ndarray:
 def parameter(
     unit: str, symbol: str, doc: str = "", *, per: str | None = None, **declared: Any
 ) -> Any:
-    """Return a dataclass field of a fitted number, declared by the attributes of `Declaration`.
+    """Return a dataclass field for a parameter; `declared` are attributes of its `Declaration`.
 
     Args:
         per: name of the attribute of the same object, `loads` or `sessions`, that holds one label
-            per entry of the leading axis; the path then ends in `@label`.
+            for each index of the array's leading axis; the path then ends in `@label`.
     """
     declaration = Declaration(unit=unit, symbol=symbol, doc=doc, **declared)
     return eqx.field(
@@ -156,7 +159,7 @@ def parameter(
 
 
 known = functools.partial(parameter, free=False)
-"""Declaration of a number that stays fixed unless the user frees it."""
+"""Same as `parameter`, for a parameter that stays fixed unless the user frees it."""
 
 
 def as_numbers(x: Any) -> Array:
@@ -167,22 +170,22 @@ def as_numbers(x: Any) -> Array:
 
 
 _OF = {"labels": "surface", "loads": "load", "sessions": "session"}
-"""Name of the `Entry` attribute that holds a label, by the attribute that lists the labels."""
+"""Name of the `Entry` attribute that holds a label, keyed by the attribute that lists labels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A declared number (or short vector) at its place in a tree.
+    """A declared parameter of a module tree, scalar or short vector, and where its array is.
 
     Attributes:
-        path: unique name, as in tables, files and errors.
+        path: unique name, as in tables, files and error messages.
         quantity: the path without the surface, load set-up or session: `surface.friction`.
         declaration: unit, bounds and prior.
         leaf: attribute names from the root to the array.
         index: position on the array's leading axis, None for the whole array.
-        size: number of values.
-        surface, load, session: label to which the number belongs, None for a number common to all
-            labels.
+        size: number of elements.
+        surface, load, session: label to which the parameter belongs, None for a parameter common to
+            all labels.
     """
 
     path: str
@@ -197,11 +200,11 @@ class Entry:
 
     @property
     def part(self) -> str:
-        """Attribute of the root to which the number belongs: `motor`, `surfaces`, `camera`."""
+        """Attribute of the root that contains the parameter, such as `motor` or `surfaces`."""
         return self.leaf[0]
 
     def whole(self, tree: Any) -> Any:
-        """Return the whole array of a tree that contains this number."""
+        """Return the whole array, in `tree`, that contains this parameter."""
         return functools.reduce(getattr, self.leaf, tree)
 
     def get(self, tree: Any) -> Any:
@@ -209,12 +212,12 @@ class Entry:
         whole = self.whole(tree)
         if self.index is None:
             return whole
-        # numpy indexes without compiling anything
+        # JAX would compile a program for this index; NumPy does not.
         return (whole if isinstance(whole, jax.core.Tracer) else np.asarray(whole))[self.index]
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names of a vector's entries, empty for a scalar."""
+        """Names of a vector's elements, empty for a scalar."""
         if self.size == 1:
             return ()
         if self.declaration.of == "axis":
@@ -223,16 +226,16 @@ class Entry:
 
     @property
     def coordinates(self) -> int:
-        """Number of search-space coordinates of the number if it is free."""
+        """Number of search-space coordinates that the parameter has if it is free."""
         return self.size - 1 if self.declaration.constrained else self.size
 
 
 def entries(tree: Any, prefix: str = "", leaf: tuple[str, ...] = ()) -> Iterator[Entry]:
-    """Yield every declared number below an equinox module, in order of declaration.
+    """Yield every declared parameter of an equinox module and its children, in declared order.
 
-    A child module with a static tuple `labels` is a stack along its leading axis: its paths read
-    `<field>.<label>.<name>`. A field `path` in the metadata renames a child (`surfaces` ->
-    `surface`).
+    A child module with a static tuple `labels` is a stack along the leading axis of its arrays: its
+    paths read `<field>.<label>.<name>`. A key `path` in the metadata of a field replaces the
+    field's name in paths (`surface` for `surfaces`).
     """
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)

@@ -1,6 +1,7 @@
 """Search space of a fit: its free parameters as one vector without bounds, and the user's choices.
 
-A "number" of a tree is one declared parameter (`slipid.parameter`), a scalar or a small vector.
+Here a "number" of a module tree is one parameter declared with `slipid.parameter`: a scalar or a
+small vector.
 """
 
 import fnmatch
@@ -17,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from slipid.parameter import Entry, entries, share_basis
 
 HELD = 1e-4
-"""Std of a prior, in the search space, with which a coordinate counts as fixed."""
+"""Largest prior std, in the search space, at which a coordinate counts as fixed by its prior."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,11 @@ class Choice:
     Attributes:
         pattern: path, with `*` and `?` as wildcards: `surface.*.creep`.
         start: start value [SI], which is also the value of a number that is not fitted.
-        fixed: value at which the number is fixed [SI]; None leaves it free.
-        free: True to fit the number, False to keep it at its start value.
-        prior_mean: mean of the prior [SI].
-        prior_std: std of the prior [SI]; without `prior_mean`, the prior is centred on the declared
-            start value.
+        fixed: value at which the number is fixed [SI]; None does not fix it.
+        free: True to fit the number, False to keep it at its start value, None to keep the default.
+        prior_mean: mean of the prior [SI]; a number with a prior is fitted.
+        prior_std: std of the prior [SI], one value or one per element; without `prior_mean`, the
+            prior is centred on the declared start value, or on equal fractions (`shares`).
     """
 
     pattern: str
@@ -52,8 +53,8 @@ class Space(eqx.Module):
         template: tree with the values of the fixed numbers and the start values of the free ones.
         start, prior_mean, prior_std: start vector, and mean and std of the prior, in the search
             space.
-        pooled: coordinates of deviations whose prior std is estimated from the data because the
-            user gave none.
+        pooled: mask of the coordinates of deviations (`Declaration.deviation`) whose prior std is
+            estimated from the data because the user gave none.
         all: every declared number of the tree.
         free: the numbers that are fitted.
     """
@@ -70,7 +71,8 @@ class Space(eqx.Module):
         """Build the space of a module with declared numbers; later choices override earlier ones.
 
         Raises:
-            ValueError: a pattern matches no path, or a value lies outside its bounds.
+            ValueError: a pattern matches no path, a value breaks the rules of its declaration, or
+                a prior std is not positive.
         """
         self.all = tuple(entries(tree))
         for c in choices:
@@ -104,18 +106,18 @@ class Space(eqx.Module):
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Slice of the search vector that holds each free number, by path."""
+        """Slice of the search vector that holds each free number, keyed by its path."""
         ends = np.cumsum([0, *(e.coordinates for e in self.free)]).tolist()
         return {e.path: slice(a, b) for e, a, b in zip(self.free, ends, ends[1:], strict=False)}
 
     def where(self, wanted: Callable[[Entry], bool]) -> Bool[np.ndarray, " free"]:
-        """Return a mask of the coordinates whose number satisfies a condition."""
+        """Return a mask of the coordinates for whose number `wanted` is true."""
         count = [e.coordinates for e in self.free]
         return np.repeat(np.array([wanted(e) for e in self.free], bool), count)
 
     @property
     def held(self) -> Bool[np.ndarray, " free"]:
-        """Mask of the coordinates that their prior holds at its mean."""
+        """Mask of the coordinates that are held at the prior mean by a std of at most `HELD`."""
         return self.prior_std <= HELD
 
     @property
@@ -167,7 +169,7 @@ def with_values(tree: Any, values: Mapping[Entry, Any]) -> Any:
 
 
 def _replaced(whole: Any, index: int | None, value: Any) -> Any:
-    """Return an array with a new value in one of its rows, or in place of the whole array."""
+    """Return an array in which `value` replaces row `index`, or all of it if `index` is None."""
     shape = whole.shape if index is None else whole.shape[1:]
     if isinstance(whole, jax.core.Tracer) or isinstance(value, jax.core.Tracer):
         traced = jnp.asarray(value, dtype=whole.dtype).reshape(shape)
@@ -181,9 +183,9 @@ def _replaced(whole: Any, index: int | None, value: Any) -> Any:
 
 
 def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
-    """Return the value [SI] of an entry, its prior mean and std, and whether it is free.
+    """Return the value [SI] of an entry, its prior mean and prior std, and whether it is free.
 
-    Prior mean and std are in the search space. `picked` are the choices that match the entry.
+    Mean and std are in the search space. `picked` are the choices that match the entry.
     """
     d = entry.declaration
     usual = np.full(entry.size, 1 / entry.size if d.shares else d.start)
@@ -224,7 +226,8 @@ def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
     x = np.asarray(std, float).ravel()
     if x.size not in (1, entry.size) or not (np.isfinite(x) & (x > 0)).all():
         raise ValueError(
-            f"{entry.path}: prior std {std}; expected 1 or {entry.size} positive numbers"
+            f"{entry.path}: prior std {std}; expected one positive number for all elements, or one "
+            f"per element ({entry.size})"
         )
     return x
 

@@ -144,13 +144,13 @@ def test_an_unknown_path_is_refused_with_the_choices(tree):
         (Choice("inner.gain", fixed=-1.0), r"inner\.gain = -1\.0: expected inside \(0, inf\) V"),
         (Choice("inner.gain", start=math.nan), r"inner\.gain = nan: expected inside"),
         (Choice("floor.b.stiff", prior_mean=9.5, prior_std=1.0), r"inside \(1, 9\)"),
-        (Choice("share@full", fixed=(0.5, 0.5, 0.5)), "positive shares that sum to 1"),
-        (Choice("share@full", fixed=(1.2, -0.1, -0.1)), "positive shares that sum to 1"),
+        (Choice("share@full", fixed=(0.5, 0.5, 0.5)), "positive fractions that sum to 1"),
+        (Choice("share@full", fixed=(1.2, -0.1, -0.1)), "positive fractions that sum to 1"),
         (Choice("share@full", start=(0.5, 0.5)), "2 values; expected 3"),
         (Choice("inner.place", start=(1.0, 2.0, 3.0)), "3 values; expected 2"),
         (Choice("inner.gain", fixed=0.0), r"inner\.gain = 0\.0: expected inside"),
-        (Choice("inner.gain", prior_std=-1.0), r"inner\.gain: prior std -1\.0; expected 1 or 1"),
-        (Choice("inner.place", prior_std=(1.0, 1.0, 1.0)), "expected 1 or 2 positive numbers"),
+        (Choice("inner.gain", prior_std=-1.0), r"inner\.gain: prior std -1\.0; expected one pos"),
+        (Choice("inner.place", prior_std=(1.0, 1.0, 1.0)), r"one per element \(2\)"),
     ],
 )
 def test_values_outside_are_refused_by_name(tree, choice, message):

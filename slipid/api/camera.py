@@ -28,7 +28,7 @@ def track(
 
     Args:
         video: file of the video, or folder of the pictures.
-        camera: calibrated camera with its place above the floor, or the path of its file.
+        camera: calibrated camera with its pose above the floor, or the path of its file.
         marker: marker in the middle of the robot, or the path of a file that describes several
             markers, boards or robots.
         fps: frames per second, if the video has no times.

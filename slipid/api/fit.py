@@ -21,7 +21,7 @@ Numbers = int | float | Sequence[int | float]
 
 @dataclass(frozen=True)
 class Prior:
-    """Gaussian prior of a number, or of every entry of a vector, in the number's unit.
+    """Gaussian prior of a parameter, or of every entry of a vector, in the parameter's unit.
 
     Attributes:
         mean: mean, one number for all entries or one for each.

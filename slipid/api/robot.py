@@ -92,8 +92,8 @@ def drive(
     if controller not in ROWS or not 0 <= start < len(places):
         names = ", ".join(ROWS)
         raise ValueError(
-            f"controller '{controller}' from start {start}; expected one of {names} and a start "
-            "from 0 to 19"
+            f"unknown controller '{controller}' or start {start}; expected one of {names}, and a "
+            "start from 0 to 19"
         )
     row, begin = ROWS[controller], places[start]
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
@@ -120,7 +120,7 @@ def export(
         robot: robot from `deploy()` of a fit or a posterior, or from `DeployedRobot.load`; its
             method `on(...)` selects some of its floors.
         folder: new or empty folder, or the folder of an older export, which is replaced.
-        to: forms to write: `c` (C99 code of the same steps of estimator and controller), `ros2`
+        to: forms to write: `c` (C99 code of the estimator's and the controller's step), `ros2`
             (parameters with the names of ros2_controllers and robot_localization), `stablehlo`,
             `table` (Markdown and CSV).
         controller: name of a controller of `slipid trial`.

@@ -26,8 +26,8 @@ class LogCheck:
 
     Attributes:
         content: summary of the runs by floor, of their channels, and of the reader's repairs.
-        result: expected verdict of each parameter, and sentences about combinations that stay
-            unknown.
+        result: expected verdict of each parameter, and sentences about combinations of parameters
+            that the runs cannot determine.
     """
 
     content: Content
@@ -96,7 +96,7 @@ def simulate_runs(
         headings: number of evenly spread directions of travel, on every floor at every speed.
         speeds: speeds of the runs [m/s].
         turns: number of additional curved runs, on every floor at every speed.
-        truth: true values of parameters, by path, that replace the usual ones [SI].
+        truth: true values of parameters, keyed by path, that replace the defaults [SI].
         current: True to simulate currents of the motors.
         voltage: True to simulate voltages of the motors.
         seed: seed of the noise.

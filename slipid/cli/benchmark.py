@@ -11,7 +11,7 @@ from slipid.support.progress import Reporter
 def benchmark(
     data: Annotated[Path, option("DIR", "Folder of the public data sets.")],
     out: Out = Path("out/benchmark"),
-    quick: Annotated[bool, flag("--quick", "Use some of the runs and a single fold only.")] = False,
+    quick: Annotated[bool, flag("--quick", "Use only some of the runs and a single fold.")] = False,
     rows: Annotated[
         str | None, option("NAMES", "Methods to run, separated by commas; all by default.")
     ] = None,
@@ -24,9 +24,10 @@ def benchmark(
     The folder given by --data contains the folders of the public data sets: robotino2022,
     robotino2021, drive_skid, borealtc; missing ones are skipped. Simulated runs of the virtual test
     site, which ship with slipid, are always included. The benchmark takes about 17 minutes on two
-    cores; with --quick about two, and three the first time. Examples of methods are ojeda_gyro and
-    quann_slip; a wrong name prints the list of all. Writes benchmark.json and benchmark.html. After
-    an interrupt, finished parts are not computed again. The exit code is 1 if anything failed.
+    cores; with --quick it takes about two minutes, or three when it first compiles its functions.
+    Examples of methods are ojeda_gyro and quann_slip; an unknown name prints the list of all
+    methods. Writes benchmark.json and benchmark.html. After an interrupt, finished parts are not
+    computed again. The exit code is 1 if anything failed.
     """
     from slipid.lab.benchmark.benchmark import benchmark as run
     from slipid.lab.benchmark.plots import benchmark_pictures

@@ -146,7 +146,8 @@ def _refuse_combinations(
         )
     if camera is not None and floor is None and points is None:
         raise DataError(
-            f"--camera {camera} alone; expected --floor PICTURE or --points CSV with it"
+            f"--camera {camera} is given, but nothing to determine the pose; expected --floor "
+            "PICTURE or --points CSV with it"
         )
 
 

@@ -28,17 +28,17 @@ def option(
     """Return an option with a value, for an annotation.
 
     Args:
-        metavar: what the value is, in a word.
+        metavar: one word for the value, such as DIR, which the help shows after the option's name.
         words: meaning of the option.
-        names: name of the option; by default it follows from that of the parameter.
-        min, max: limits of a number.
+        names: name of the option; by default it is made from the name of the function's parameter.
+        min, max: limits of a numeric value.
     """
     made: OptionInfo = typer.Option(*names, metavar=metavar, help=words, min=min, max=max)
     return made
 
 
 def flag(name: str, words: str) -> OptionInfo:
-    """Return an option without a value, which has no opposite."""
+    """Return an option without a value and without an opposite of the form --no-NAME."""
     made: OptionInfo = typer.Option(name, help=words)
     return made
 
@@ -61,7 +61,7 @@ Jobs = Annotated[
 Json = Annotated[
     str | None, option("FILE", "Also write the result as JSON to this file; - for stdout.")
 ]
-Quiet = Annotated[bool, flag("--quiet", "No progress.")]
+Quiet = Annotated[bool, flag("--quiet", "Print no progress.")]
 Words = ParamSpec("Words")
 
 

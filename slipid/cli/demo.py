@@ -46,7 +46,7 @@ def demo(
     pictures = [result / name for name in done.written if name.endswith(".png")]
     pictures += sorted(result.glob("validation_*.png"))
     page.line(f"\nlook at: {', '.join(map(str, pictures))}")
-    page.line(f"numbers: {result / 'identified.json'}, {result / 'validation.json'}")
+    page.line(f"values: {result / 'identified.json'}, {result / 'validation.json'}")
     return 0 if done.fit.converged else 1
 
 
@@ -73,7 +73,7 @@ def run(
     if plant not in ("recorded", "mujoco"):
         raise DataError(f"--plant {plant}: unknown; expected recorded or mujoco")
     if plant == "recorded" and seed is not None:
-        raise DataError("--seed without a simulation; expected --plant mujoco with it")
+        raise DataError("--seed is given without a simulation; expected --plant mujoco with it")
     source = out / plant
     if plant == "recorded":
         report.stage("unpacking recorded logs")
@@ -92,7 +92,7 @@ def run(
 
 
 def drive_anew(out: Path, seed: int, executor: "Executor", report: Reporter) -> None:
-    """Simulate on the test site all runs whose logs also ship with slipid."""
+    """Simulate anew, on the test site, all runs whose recorded logs ship with slipid."""
     from slipid.app.logs import packaged_config
     from slipid.lab.testsite.config import plan
     from slipid.lab.testsite.simulate import simulate

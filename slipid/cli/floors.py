@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 MOST_BEYOND = 0.05
-"""The exit code is 1 if more than this share of the wheel positions is outside the map [1]."""
+"""The exit code is 1 if more than this fraction of the wheel positions is outside the map [1]."""
 
 
 @for_robots
@@ -46,7 +46,7 @@ def floors(
 
 
 def show(page: "Page", content: Content) -> None:
-    """Print, for each run, the share of time in which each floor was under each wheel."""
+    """Print, for each run, the percentage of the time that each floor was under each wheel."""
     from slipid.report.page import table
 
     shares = table(("run", *content["surfaces"]), "percentage of the time, for wheel 1, 2, ...")

@@ -33,7 +33,7 @@ def identify(
     """Fit the parameters of motors, floors, loads and camera to logs.
 
     Writes identified.json, fit.json, robot.json and pictures. An interrupted fit is continued. The
-    exit code is 1 if the fit did not converge, or predicts runs worse than the encoders alone.
+    exit code is 1 if the fit did not converge, or predicts runs worse than odometry from encoders.
     """
     from slipid.app.config import BenchMotors, read_config
     from slipid.report.estimates import show_fit, show_trust
@@ -97,7 +97,7 @@ def bench(
     from slipid.report.estimates import show_bench
 
     if profile:
-        raise DataError("--profile is not available for drive = 'motor'; leave it out")
+        raise DataError("--profile is not available for drive = 'motor'; omit it")
     with Reporter(quiet=quiet) as report:
         fit, written = identify_bench(config, data, out, report)
         report.stage("drawing")

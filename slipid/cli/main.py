@@ -42,7 +42,8 @@ for command in (
     *(design, trial, export, simulate, calibrate, track, map_, floors, paper),
     *(benchmark, demo),
 ):
-    app.command(command.__name__.rstrip("_"))(command)  # `map_` is named so because of Python's map
+    # strip the underscore of `map_`, which only keeps the name of Python's built-in map free
+    app.command(command.__name__.rstrip("_"))(command)
 
 AGAIN_S = 0.05
 """Delay before an interrupt that Python ignored is sent again [s]."""
@@ -57,8 +58,8 @@ def main() -> None:
 def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
     """Send an interrupt again if Python ignored it.
 
-    Python ignores it if it arrives in a finaliser or in a callback of the garbage collector (jax
-    has one), where no exception can be raised.
+    Python ignores an interrupt that arrives in a finaliser or in a callback of the garbage
+    collector (jax has one), where no exception can be raised.
     """
     if lost.exc_type is KeyboardInterrupt:
         again = threading.Timer(AGAIN_S, _thread.interrupt_main)

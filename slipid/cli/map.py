@@ -48,9 +48,10 @@ def map_(
 ) -> int:
     r"""Make a map of the surfaces of a floor from one picture from above; needs slipid\[camera].
 
-    Without a config, the command proposes surfaces and writes them to palette.toml; rename them
-    there and run the command again with --config. It writes map.geojson, the format of all options
-    for maps, and a picture of the map for checking. The exit code is 1 if the map is poor.
+    Without a config, the command proposes surfaces and writes them to palette.toml; rename the
+    surfaces there and run the command again with --config. The command writes map.geojson, which
+    every option for a floor map accepts, and a picture for checking the map. The exit code is 1 if
+    the map is poor.
     """
     from slipid.camera.floor.grid import RobotShape
     from slipid.camera.floor.picture import MapOptions, map_of
@@ -59,7 +60,7 @@ def map_(
     from slipid.support.files import write_bytes
     from slipid.support.jax_setup import one_blas_thread
 
-    one_blas_thread()  # the computation uses many small matrices
+    one_blas_thread()  # several threads would slow down the many small matrix products
     robot = RobotShape(dictionary, robot_radius, marker_height)
     options = MapOptions(config, surfaces, robot, cell)
     with Reporter(quiet=quiet) as report:
@@ -106,6 +107,7 @@ def show(page: "Page", result: "PictureMap", out: Path) -> None:
         page.line(f"poor: {sentence}")
     if result.proposal is not None:
         page.line(
-            f"these surfaces are a proposal: rename or merge them in {out / PROPOSAL}, then add"
+            f"these surfaces are a proposal: rename or merge them in {out / PROPOSAL}, then run "
+            "the same command with"
         )
         page.line(f"  --config {out / PROPOSAL}")

@@ -19,16 +19,16 @@ def motor(
     time: Annotated[Column, _column("Column with the time, in s.")] = None,
     voltage: Annotated[Column, _column("Column with the voltage across the motor, in V.")] = None,
     current: Annotated[
-        Column, _column("Column with the current, in A; other units as I:mA.")
+        Column, _column("Column with the current, in A; with another unit, such as I:mA.")
     ] = None,
     speed: Annotated[
-        Column, _column("Column with the shaft speed, in rad/s; other units as w:rpm.")
+        Column, _column("Column with the shaft speed, in rad/s; with another unit, such as w:rpm.")
     ] = None,
     angle: Annotated[
         Column, _column("Column with the shaft angle, in rad, instead of the speed.")
     ] = None,
     duty: Annotated[
-        Column, _column("Column with the duty cycle, instead of the voltage; d:% for percent.")
+        Column, _column("Column with the duty cycle, 0 to 1, instead of the voltage; in %, as d:%.")
     ] = None,
     bus: Annotated[Column, _column("Column with the bus voltage, in V; with --duty.")] = None,
     unsigned: Annotated[

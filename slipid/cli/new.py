@@ -32,9 +32,7 @@ def new(
     ] = None,
     drive: Annotated[
         Text,
-        _text(
-            "Type of the wheels: Type of the wheels: omni, mecanum, skid, differential or general."
-        ),
+        _text("Type of the wheels: omni, mecanum, skid, differential or general."),
     ] = None,
     wheel_radius_m: Annotated[Text, _text("Wheel radius.")] = None,
     gear_ratio: Annotated[Text, _text("Motor turns per wheel turn.")] = None,
@@ -47,7 +45,7 @@ def new(
         Text, _text("Distance between left and right wheels; also for a differential drive.", _BOX)
     ] = None,
     shared: Annotated[
-        Text, _text("yes if one motor drives both wheels of a side, else no.", _BOX)
+        Text, _text("Enter yes if one motor drives both wheels of a side, otherwise no.", _BOX)
     ] = None,
     wheels: Annotated[Text, _text("Number of omni wheels.", _WHEELS)] = None,
     azimuths_deg: Annotated[
@@ -68,10 +66,10 @@ def new(
     yes: Annotated[
         bool, flag("--yes", "Do not ask: use defaults, which are marked in the config.")
     ] = False,
-    force: Annotated[bool, flag("--force", "Overwrite.")] = False,
+    force: Annotated[bool, flag("--force", "Overwrite an existing file.")] = False,
 ) -> int:
     """Write a commented config for your robot, from your answers to questions or from its logs."""
-    # Every argument that is a text describes the robot.
+    # collect the arguments that are texts: these, and no others, describe the robot
     options = {name: text for name, text in locals().items() if isinstance(text, str)}
 
     from slipid.app.new.config_text import new_config
@@ -101,7 +99,7 @@ def _ask(asks: str, default: str, wrong: str) -> str:
     Args:
         asks: the question.
         default: answer that is used if the user only presses Enter.
-        wrong: error message about the previous answer; empty for the first question.
+        wrong: error message about the previous answer to this question; empty the first time.
 
     Raises:
         DataError: there is no answer, because the input has ended.

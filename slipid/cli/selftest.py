@@ -1,4 +1,4 @@
-"""`slipid selftest`: test by simulation which numbers an experiment can recover."""
+"""`slipid selftest`: test by simulation which parameters an experiment can recover."""
 
 from pathlib import Path
 from typing import Annotated

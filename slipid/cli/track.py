@@ -64,7 +64,8 @@ def track(
         Path | None, option("FILE", "Picture to write, with the poses of one frame drawn in it.")
     ] = None,
     preview_frame: Annotated[
-        int | None, option("N", "Number of this frame; by default the first with a pose.", min=0)
+        int | None,
+        option("N", "Frame to draw in --preview; by default the first with a pose.", min=0),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,

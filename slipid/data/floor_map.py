@@ -1,4 +1,4 @@
-"""Floor maps, which give the surface at every place of a floor.
+"""Floor maps, which give the surface at every point of a floor.
 
 A map is made from polygons, from a picture, from a map file or at random.
 """
@@ -50,9 +50,9 @@ class FloorMap:
         return x, y, x + columns * self.cell, y + rows * self.cell
 
     def at(self, xy: Float[np.ndarray, "*batch 2"]) -> Int[np.ndarray, "*batch"]:
-        """Return the index of the surface at places x, y [m].
+        """Return the index in `surfaces` of the surface at each point x, y [m].
 
-        For a place outside the map, the nearest cell at the edge of the map is used.
+        A point outside the map has the surface of the nearest cell at the edge of the map.
         """
         steps = np.floor((np.asarray(xy) - self.corner) / self.cell).astype(np.intp)
         rows, columns = self.cells.shape
@@ -61,7 +61,7 @@ class FloorMap:
 
 
 def uniform(surface: str, half: float = 2.0) -> FloorMap:
-    """Return a map with one surface everywhere, a square with edges of `2 * half` [m]."""
+    """Return a square map of a single surface, whose edges are `2 * half` long [m]."""
     return FloorMap((surface,), np.zeros((1, 1), np.intp), (-half, -half), 2 * half)
 
 
@@ -99,12 +99,13 @@ def from_polygons(
 def patchwork(
     surfaces: Sequence[str], seed: int, patch: float = 0.25, half: float = 1.2, cell: float = 0.005
 ) -> FloorMap:
-    """Return a random floor whose patches are cells of a jittered grid.
+    """Return a random floor whose patches are the Voronoi cells of a jittered grid of points.
 
-    By default the patches are smaller than a Robotino, so that its wheels stand on several.
+    By default the patches are smaller than a Robotino, so that its wheels stand on several patches
+    at once.
 
     Args:
-        surfaces: surfaces, one of which is drawn for each patch.
+        surfaces: names of the surfaces, one of which is drawn at random for each patch.
         seed: seed of the jitter and of the choice of surfaces.
         patch: mean distance between neighbouring patches [m].
         half: half of the floor's edge length [m].
@@ -133,12 +134,13 @@ def patchwork(
 def four_zones(surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.2)) -> FloorMap:
     """Return the map of four surfaces that meet in a point.
 
-    The point is by default the centre of the rectangle that the robot drives in the paper.
+    By default this point is the centre of the rectangle that the robot drives in the 2021 paper.
 
     Args:
         surfaces: surfaces of the quarters with low x and high y, high x and high y, high x and low
             y, and low x and low y.
-        middle: x, y of the point where they meet [m]; every zone is a square of 1.2 m.
+        middle: x, y of the point where the surfaces meet [m]; every zone is a square with edges of
+            1.2 m.
     """
     reach, cell = 1.2, 0.005
     names = tuple(dict.fromkeys(surfaces))
@@ -256,10 +258,13 @@ def _pictured(path: Path, given: PicturedFile) -> FloorMap:
         picture = np.asarray(imread(source), float)
     except (OSError, ValueError, SyntaxError) as error:
         raise DataError(f"{path}: picture {source}: {error}; expected a PNG or JPEG") from error
-    if picture.ndim == 2:  # shades of grey
+    if picture.ndim == 2:  # a grey picture has no axis of colours
         picture = np.repeat(picture[..., None], 3, axis=2)
     if picture.shape[0] * picture.shape[1] > MOST_CELLS:
-        raise DataError(f"{path}: picture {source}: expected at most {MOST_CELLS} pixels")
+        raise DataError(
+            f"{path}: picture {source}: {picture.shape[1]} x {picture.shape[0]} pixels; expected "
+            f"at most {MOST_CELLS} pixels"
+        )
     picture = picture[..., :3] if picture.max() <= 1 else picture[..., :3] / 255
     wanted = np.array([to_rgb(colour) for colour in given.colours.values()])
     distance = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)

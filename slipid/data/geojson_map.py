@@ -1,7 +1,7 @@
 """Floor maps as polygons in a GeoJSON file, with coordinates in metres instead of degrees.
 
-Parts of the floor outside all polygons are unknown; in a floor map read from the file they get the
-nearest surface.
+The surface outside all polygons is unknown; in a floor map read from the file, it is that of the
+nearest polygon.
 """
 
 from dataclasses import dataclass
@@ -31,8 +31,8 @@ class Patch:
 
     Attributes:
         surface: name of the patch's surface.
-        rings: corners x, y [m], the outer ring first, then rings around holes; the last corner does
-            not repeat the first.
+        rings: corners x, y of each ring [m]: the outer ring first, then the rings around holes; the
+            last corner of a ring does not repeat its first corner.
         area: area of the patch without its holes [m^2].
         confidence: distance from the patch's appearance to that of the second-best surface, in
             multiples of the spread within one surface [1]; None where there is only one surface.
@@ -174,7 +174,8 @@ def covered(
     turns = np.zeros((rows, columns + 1), np.intp)
     for ring in rings:
         for (x, y), (x2, y2) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-            # The edge crosses rows whose centre lies at or above its lower end and below its upper.
+            # The edge crosses the rows whose centres lie between its lower end (included) and its
+            # upper end (excluded), so that a corner shared by two edges counts once.
             first, last = np.clip(np.ceil(np.sort([y, y2]) - 0.5), 0, rows).astype(int)
             if first < last:
                 row = np.arange(first, last)

@@ -22,7 +22,7 @@ class Log:
         sha256: SHA-256 hash of the file's bytes.
         time: time [s], strictly increasing; it starts at 0 if the logged clock counts from 1970.
         wheel_angle: angle of each wheel [rad], cumulative from the first row, interpolated linearly
-            between readings; without columns if the log has only poses.
+            between readings; it has no columns if the log has only poses.
         wheel_speed: reported speed of each wheel [rad/s], or None.
         wheel_speed_command: commanded speed of each wheel [rad/s], or None.
         twist_command: commanded x [m/s], y [m/s] and yaw rate [rad/s], or None.

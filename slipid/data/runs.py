@@ -23,21 +23,23 @@ class Runs:
     """A set of runs; each array contains the samples of all runs, one run after another.
 
     Attributes:
-        logs: the runs; their arrays are views of the flat ones below, except for the raw wheel
-            angles of runs in which a stall was bridged.
+        logs: the runs; their arrays are views of the flat arrays below, but a run in which a stall
+            was bridged keeps its own raw wheel angles.
         offset: index of the first sample of each run, and finally the number of samples.
         time: time within the run [s] (sample,).
         wheel_angle: angle of each wheel [rad] (sample, wheel), linear across telemetry stalls.
         pose: x [m], y [m], heading [rad], in the scale of the log.
         fresh: False where the row repeats the last camera frame.
         live: False in the rows of a telemetry stall, whose currents are stale.
-        current: motor currents [A], or None.
-        voltage: motor voltages [V], or None.
+        current: motor currents [A] (sample, wheel), or None if a run has none.
+        voltage: motor voltages [V] (sample, wheel), or None if a run has none.
         current_fresh: False where a current repeats the last reading (sample, wheel), or None.
         voltage_fresh: False where a voltage repeats the last reading (sample, wheel), or None.
         current_is_signed: False if some log has only magnitudes of currents.
-        session: name of each run's session, in which the marker stayed in place.
-        heading: commanded direction of travel of each run [rad]; nan if it turns on the spot.
+        session: name of each run's session; within a session the camera's marker was not moved on
+            the robot.
+        heading: commanded direction of travel of each run [rad]; nan if the robot turns on the spot
+            or no command was logged.
         speed: commanded speed of each run [m/s]; nan if no command was logged.
         turn: commanded yaw rate of each run [rad/s]; nan if no command was logged.
         aside: one line about each run that was left out because its pose jumps.
@@ -92,9 +94,9 @@ def collect(
 
     Args:
         logs: the runs.
-        session: session of each run, in which the marker stayed in place on the robot; by default
-            the runs with the same surface, load set-up and commanded speed are one session, since
-            test grids are driven in that order.
+        session: name of each run's session; within a session the camera's marker was not moved on
+            the robot. By default the runs with the same surface, load set-up and commanded speed
+            are one session, since the runs of an experiment are usually driven in that order.
         aside: one line about each run that was left out because its pose jumps.
 
     Raises:
@@ -123,7 +125,7 @@ def collect(
     )
 
     def view(k: int, log: Log) -> Log:
-        """Return a run with views of the flat arrays; with stalls it keeps its raw wheel angle."""
+        """Return a run with views of the flat arrays; one with stalls keeps its wheel angle."""
         views: dict[str, Any] = {n: a[offset[k] : offset[k + 1]] for n, a in flat.items()}
         if bridged[k][0] is not log.wheel_angle:
             del views["wheel_angle"]
@@ -226,7 +228,7 @@ def _command(log: Log) -> tuple[float, float, float]:
 
 
 def first_row(data: Runs, run: int, wheel_radius: float) -> int:
-    """Return the first row of a run by which the rim of some wheel has moved `MOVED_M`.
+    """Return the first row of a run in which the rim of some wheel has moved by `MOVED_M`.
 
     Raises:
         DataError: no rim moves that far in the run.

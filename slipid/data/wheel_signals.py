@@ -1,7 +1,7 @@
 """Functions on the signals of one run.
 
 They compute increments of motion, find the rows in which a slow sensor was read, interpolate across
-telemetry stalls, and find the first motion and wheels in the wrong order.
+telemetry stalls, and detect the start of motion and a wrong order of the wheels.
 """
 
 from collections.abc import Iterable
@@ -15,15 +15,15 @@ MOVED_M = 0.010
 STALL_STEPS = 3
 """In a telemetry stall, no wheel angle changes for at least this number of rows."""
 DOUBTFUL_MISFIT = 0.05
-"""Other orders of wheels are tried if the misfit of the declared order (see `swapped_order`)
-exceeds this [1]; errors of the speed control alone cause less."""
+"""Another order of the wheels is considered only if the misfit of the declared order (see
+`swapped_order`) exceeds this [1]; speed-control errors cause a smaller misfit."""
 LEAST_CHANGES = 8
 """Least number of changes of a sensor's value that suffices to estimate its refresh period."""
 LEAST_CHANGES_PER_RUN = 3
 """Least number of changes per run, on average, that suffices to estimate a refresh period."""
 CLEARLY_BETTER_RATIO = 0.25
-"""Another order of wheels is reported if its misfit is below this share of the declared order's
-misfit [1]."""
+"""Another order of the wheels is reported if its misfit is below this multiple of the declared
+order's misfit [1]."""
 
 
 def interpolate(
@@ -63,10 +63,11 @@ def refresh_period(
 ) -> float | None:
     """Return the refresh period of a sensor that is read less often than rows are logged [s].
 
-    The result is None if the sensor is not that slow. At most one in twenty changes of a slow
-    sensor follows another in the very next row, whereas a sensor that is read in every row and
-    sometimes repeats a value often changes in two successive rows. A slow sensor must change
-    several times in a run, because a single change may be a step of the measured quantity.
+    The result is None if the sensor seems to be read in every row, or if its value changes too
+    rarely to tell. At most one in twenty changes of a slow sensor follows another in the very next
+    row, whereas a sensor that is read in every row and sometimes repeats a value often changes in
+    two successive rows. A slow sensor must change several times in a run, because a single change
+    may be a step of the measured quantity.
     """
     rows: list[np.ndarray] = []
     seconds: list[np.ndarray] = []
@@ -88,7 +89,7 @@ def read_anew(
 ) -> Bool[np.ndarray, " time"]:
     """Return whether a sensor with a refresh period [s] was read in each row.
 
-    It was read where its value changes, and once every period while the value stays constant.
+    It counts as read where its value changes, and once every period while the value stays constant.
     """
     out = np.zeros(len(time), dtype=bool)
     out[0] = True
@@ -125,7 +126,7 @@ def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
 
 
 def stretches(mask: Bool[np.ndarray, " row"]) -> Int[np.ndarray, "stretch 2"]:
-    """Return the first row, and the row after the last, of every sequence of consecutive True."""
+    """Return the first row, and the row after the last, of every sequence of True values."""
     return np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2)
 
 
@@ -134,9 +135,9 @@ def bridge_stalls(
 ) -> tuple[Float[np.ndarray, "time wheel"], Bool[np.ndarray, " time"]]:
     """Return the wheel angle, linear across telemetry stalls, and whether each row is in a stall.
 
-    In a stall no wheel's angle changes for some rows, and then all change in one step by about the
-    missed motion: the radio link was interrupted while the wheels went on turning. Speeds and
-    currents reported in these rows are outdated, too.
+    In a stall no wheel's angle changes for some rows, and then all angles change in one step by
+    about the missed motion: the radio link was interrupted while the wheels went on turning. Speeds
+    and currents reported in these rows are outdated, too.
     """
     stalled = np.zeros(len(time), dtype=bool)
     step = np.abs(np.diff(wheel_angle, axis=0)).max(axis=1, initial=0.0)
@@ -160,7 +161,7 @@ def bridge_stalls(
 
 
 def first_moved(wheel_angle: Float[np.ndarray, "time wheel"], radius: float) -> int | None:
-    """Return the first row by which some wheel's rim has moved `MOVED_M`, or None if none does.
+    """Return the first row in which some wheel's rim has moved by `MOVED_M`, or None if none does.
 
     `radius` is the radius of the wheels [m].
     """
@@ -172,16 +173,18 @@ def first_moved(wheel_angle: Float[np.ndarray, "time wheel"], radius: float) -> 
 def swapped_order(
     measured: Float[np.ndarray, "time wheel"], reference: Float[np.ndarray, "time wheel"]
 ) -> tuple[int, ...] | None:
-    """Return the measured column of each wheel, such as (3, -1, 2), or None if the order is right.
+    """Return the measured column of each wheel, such as (3, -1, 2), or None to keep the order.
 
     Columns are counted from 1; a negative number is a column with the opposite sign. The result is
     the order and signs in which the measured steps are closest to the reference:
 
         misfit = sum_i |m_order(i) sign_i - ref_i|^2 / sum_i |ref_i|^2
 
-    It is computed from the sums of products of every pair of columns, so that trying all orders of
-    six wheels is fast. Steps may be any measure of wheel motion, such as the angle turned [rad],
-    the same in both arrays.
+    where i runs over the wheels and |.| is the norm over all steps. The misfit is computed from the
+    sums of products of every pair of columns, so that trying all orders of six wheels is fast.
+    Steps may be any measure of wheel motion, such as the angle turned [rad], the same in both
+    arrays. The result is None unless the misfit of the declared order exceeds `DOUBTFUL_MISFIT` and
+    another order is clearly better.
     """
     products = measured.T @ reference
     norm, reference_norm = float(np.sum(measured**2)), float(np.sum(reference**2))

@@ -93,7 +93,7 @@ def windows(
         longest: largest duration of a window [s]; longer runs have more segments.
 
     Raises:
-        DataError: a run has no wheel that moves `MOVED_M`, or has too few poses for its windows.
+        DataError: no wheel of a run moves by `MOVED_M`, or a run has too few poses for its windows.
     """
     each = [_edges(data, k, wheel_radius, lag, per_segment, longest) for k in range(len(data))]
     run = [k for k, segments in enumerate(each) for _ in segments]
@@ -121,13 +121,14 @@ def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
 
     It uses second differences d_t = x_(t-1) - 2 x_t + x_(t+1), which have six times the variance of
     white noise and suppress smooth signals: of the variance of a ripple with a period of n readings
-    only the share (2 - 2 cos(2 pi / n))^2 / 6 remains, 6 % at n = 8. The std of d is taken from the
-    quantile of |d| at 68 %, so that jumps have little weight.
+    only the fraction (2 - 2 cos(2 pi / n))^2 / 6 remains, 6 % at n = 8. The std of d is taken from
+    the quantile of |d| at 68 %, so that jumps have little weight.
 
     Limits: ripple with a shorter period, or aliased by slow sampling, counts as noise; repeated
-    readings, or smoothing in the motor driver, make the estimate too small; readings with a
-    resolution coarser than the noise give an estimate of a few of its steps, and never less than
-    the rounding noise; magnitudes of currents near zero have less noise than signed currents.
+    readings, or smoothing in the motor driver, make the estimate too small; if the resolution of
+    the readings is coarser than the noise, the estimated std is a small multiple of the resolution,
+    and at least the rounding noise; magnitudes of currents near zero have less noise than signed
+    currents.
     """
     out = np.zeros((len(data), data.wheel_angle.shape[1]))
     if data.current is None:
@@ -162,8 +163,8 @@ def _edges(
 ) -> list[np.ndarray]:
     """Return, for each segment of a run, the rows at the edges of its windows.
 
-    These rows have a new pose, and the true time of this pose, which is earlier by the lag, lies in
-    the record of the wheels.
+    Each of these rows has a new pose. The true time of this pose is earlier by the lag, and lies
+    within the record of the wheels.
     """
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
@@ -190,7 +191,7 @@ def _edges(
 def _cut(
     data: Runs, run: int, edges: np.ndarray, lag: float, noise: Float[np.ndarray, " wheel"]
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of `Windows` for one segment, by the attribute's name.
+    """Return the arrays of `Windows` for one segment, keyed by the name of the attribute.
 
     Args:
         data: the runs.
@@ -245,22 +246,22 @@ def _mean(
     fresh: Bool[np.ndarray, "row wheel"] | None,
     at: Float[np.ndarray, " edge"],
 ) -> tuple[PerWindow, PerWindow, PerWindow]:
-    """Return each window's time average, number of readings, and variance by missing readings.
+    """Return each window's time average, its number of readings, and the average's variance.
 
     Each row is weighted by the time from the middle between it and the previous row to the middle
     between it and the next row. (A plain mean over the rows in a window would be biased, because
     its first row comes after the edge: while a robot speeds up, mean voltages would be too high.)
-    Between the readings of a slow meter the signal is taken as linear; if it really jumped from one
-    reading to the next at an unknown time in between, the mean over that time has an error with a
-    std of their difference over sqrt(12). Rows of telemetry stalls are left out, except in windows
-    that have no other rows.
+    Between the readings of a slow meter the signal is taken as linear. If it really jumped from one
+    reading to the next at an unknown time in between, the mean over that time has an error whose
+    std is the difference of the two readings over sqrt(12); the returned variance is due to these
+    errors. Rows of telemetry stalls are left out, except in windows that have no other rows.
 
     Args:
         time: times of the rows [s].
         x: current [A] or voltage [V] of each wheel's motor.
         live: False in the rows of a telemetry stall.
         fresh: True for values that were read in their row; None if all were.
-        at: times of the window edges on the clock of the rows [s].
+        at: times of the window edges, on the same clock as `time` [s].
     """
     bounds = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
     cell = np.diff(bounds)[:, None]

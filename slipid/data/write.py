@@ -1,4 +1,4 @@
-"""Texts of log files, with the columns of slipid or those of the published Robotino logs."""
+"""Texts of log files, with slipid's own columns or with those of the published Robotino logs."""
 
 from collections.abc import Sequence
 from io import StringIO
@@ -23,7 +23,7 @@ _IMAGE = (1920, 1080)
 def own_columns(wheels: int, more: Sequence[str]) -> Content:
     """Return the `columns` table of a config for files written by `own_csv`.
 
-    `more` has the names of the `OPTIONAL` channels in the file.
+    `more` lists the channels of `OPTIONAL` that the file has.
     """
     columns: Content = {
         "time": {"column": "time", "unit": "s"},
@@ -88,9 +88,9 @@ _NAMES_2022 = (
 def robotino2022_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
     """Return the text of a run's file in the layout of the 2022 Robotino logs.
 
-    The preset `robotino2022` reads it. The run has three wheels, commands, speeds, currents and
-    poses. The origin of the poses is the centre of the image. The columns of projected currents and
-    of steps, which the published logs have, are zeros.
+    The preset `robotino2022` reads such files. The run must have three wheels, commands, speeds,
+    currents and poses. The origin of the poses is the centre of the image. The published logs also
+    have columns of projected currents and of pose steps; these columns are zeros here.
     """
     assert log.twist_command is not None
     assert log.wheel_speed is not None

@@ -1,19 +1,19 @@
 """Variances of run, shared and session effects, and of load biases, by restricted likelihood.
 
-After a fit, every run on a floor has a remaining effect along, across and in yaw. On one axis, the
-remaining effects of these runs,
+After a fit, every run i on a floor has a remaining effect along, across and in yaw,
 
     a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i
 
-have the covariance given below. E_i is the change of the residuals r_i of run i per unit of an
-effect; W_i is the inverse of their covariance without the run effects.
+where r_i are the run's residuals, E_i is their change per unit of an effect, and W_i is the inverse
+of the covariance that r_i has without run effects. On one axis, the remaining effects of all runs
+on the floor have the covariance
 
     N + v_own D + v_near K + v_session M + T C T^T
 
-N is the variance from camera and process noise, D the diagonal of inverse Student-t weights, K the
-kernel over driving conditions, and M is 1 for two runs of the same session and 0 otherwise. T is
-the derivative of the effects by the model's fitted numbers, and C the covariance of these numbers
-before the floor's own runs were used.
+N is the variance from camera and process noise, D the diagonal matrix of inverse Student-t weights,
+K the kernel over driving conditions, and M is 1 for two runs of the same session and 0 otherwise. T
+is the derivative of the effects with respect to the model's fitted parameters, and C the covariance
+of these parameters before the floor's own runs were used.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -37,11 +37,11 @@ _SECTORS = 6
 LEAST_RUNS = 30
 """Smallest number of runs from which the 90 % coverage of end points is estimated.
 
-With fewer runs, less than three are expected outside the 90 % region."""
+With fewer runs, fewer than three end points are expected outside their 90 % regions."""
 _MOST_GROWTH = 10.0
 """Largest factor by which `extrapolation` multiplies variances."""
 _GRID = np.geomspace(0.1, 4.0, 60)
-"""Candidate stds of the load biases, divided by the typical std."""
+"""Candidate stds of the load biases, as multiples of the typical std."""
 
 
 class AxisEffects(NamedTuple):
@@ -54,7 +54,7 @@ class AxisEffects(NamedTuple):
         fixed: part of the covariance of `left` that does not depend on the estimated variances.
         noise: part of the diagonal of `fixed` that comes from camera and process noise.
         numbers: indices of the estimated variances among all variances.
-        bases: derivative of the covariance of `left` by each estimated variance.
+        bases: derivative of the covariance of `left` with respect to each estimated variance.
         typical: centre of the prior of each estimated log variance.
     """
 
@@ -69,7 +69,7 @@ class AxisEffects(NamedTuple):
 
 
 def effect_variances(axes: Iterable[AxisEffects], log_v: Variances) -> Variances:
-    """Return all log variances after scoring steps for those of run, shared and session effects."""
+    """Return all log variances, those of run, shared and session effects after scoring steps."""
     out = np.array(log_v)
     for axis in axes:
         out[axis.numbers] = _scoring_steps(axis, out[axis.numbers])
@@ -99,26 +99,27 @@ def extrapolation(
     distance: Float[np.ndarray, " segment"],
     setup: Sequence[str],
 ) -> dict[str, float]:
-    """Return the factors that correct too small variances in unfitted directions, by set-up.
+    """Return the factor that enlarges the variances in directions without runs, keyed by set-up.
 
-    Every sector of directions is predicted from the others, with the numbers of the floor estimated
-    anew (to first order). The variances of shared effects and of the numbers are multiplied by the
-    factor that puts 90 % of the end points into their 90 % regions; the variances of the run's own
-    effects and of the noise, which neighbours do not predict, are kept. The factor is 1 if at least
-    90 % of the end points already lie in their regions, or if there are fewer than three sectors or
-    fewer than `LEAST_RUNS` runs. The factor is needed for two reasons: maximum likelihood fits the
-    variances to distances between neighbouring runs, so that they are too small if the model is
-    wrong on a larger scale; and it down-weights outliers, which occur in forecast runs as well.
+    The runs of each sector of directions are predicted from the other sectors, with the parameters
+    of the floor estimated without that sector (to first order). The variances of shared effects and
+    of the parameters are multiplied by the factor that puts 90 % of the end points into their 90 %
+    regions; the variances of individual run effects and of the noise, which other runs do not
+    predict, are kept. The factor is 1 if at least 90 % of the end points already lie in their
+    regions, or if there are fewer than three sectors or fewer than `LEAST_RUNS` runs. The factor is
+    needed for two reasons: maximum likelihood fits the variances to distances between neighbouring
+    runs, so that the variances are too small if the model is wrong on a larger scale; and the fit
+    down-weights outliers, which occur in forecast runs as well.
 
     Args:
         axes: results of `axis_effects`.
         log_v: all log variances.
         direction: direction of travel relative to the body [rad], nan for turns on the spot.
         distance: distance driven in every segment [m].
-        setup: name that stands for the floor and the load set-up of every segment.
+        setup: label of the floor and load set-up of every segment.
 
-    Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
-    2013, Computational Statistics and Data Analysis 66, on wrong models.
+    Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), equations for left-out data;
+    Bachoc 2013, Computational Statistics and Data Analysis 66, on wrong models.
     """
     held_out, names = _held_out_effects(axes, log_v, direction), np.asarray(setup)
     return {
@@ -127,7 +128,7 @@ def extrapolation(
 
 
 class _HeldOutEffects(NamedTuple):
-    """Prediction errors of each segment's effects from the other sectors; nan without a prediction.
+    """Errors of predicting each segment's effects from the other sectors; nan if not predicted.
 
     Attributes:
         gap: effect less its prediction, on each axis.
@@ -166,10 +167,10 @@ def _variance_growth(
     distance: Float[np.ndarray, " segment"],
     mine: Bool[np.ndarray, " segment"],
 ) -> float:
-    """Return the factor of one set-up's variances at which 90 % of end points are in 90 % regions.
+    """Return the factor of one set-up's variances that puts 90 % of end points in 90 % regions.
 
-    `mine` marks the segments of the set-up. The variances of the individual effects and noise of
-    each run are not multiplied.
+    `mine` marks the segments of the set-up. The factor does not multiply the variances of
+    individual run effects and of the noise.
     """
     mine = mine & np.isfinite(held_out.gap).all(axis=1)
     if mine.sum() < LEAST_RUNS:
@@ -218,7 +219,8 @@ def axis_effects(
     """Yield the remaining effects of every floor and axis.
 
     Args:
-        motion: motion residuals of all segments and their derivative by the search vector.
+        motion: motion residuals of all segments, and their derivative with respect to the search
+            vector.
         weight: Student-t weight of every segment, 0 for a segment that is left out of the fit.
         covariance: covariance of the search vector.
         log_v: all log variances.
@@ -251,8 +253,8 @@ def _variance_bases(
 ) -> list[tuple[int, np.ndarray]]:
     """Return pairs of a variance's index and its derivative matrix, for the effects on one axis.
 
-    The matrix is the covariance of the effects per unit of the variance. The pairs are those of
-    own, neighbours' and session effects, as far as the floor has them.
+    The matrix is the covariance of the effects per unit of the variance. There is one pair for each
+    variance that the floor has: of run, neighbours' and session effects.
     """
     own, near, session = np.asarray(floor.numbers)[:, axis].tolist()
     root, member = np.asarray(floor.near)[axis, kept], np.asarray(floor.session)[kept]
@@ -266,9 +268,9 @@ def _covariance(axis: AxisEffects, v: np.ndarray) -> Float[np.ndarray, "run run"
 
 
 def _information(grown: list[np.ndarray]) -> np.ndarray:
-    """Return the expected information of the log variances.
+    """Return the expected Fisher information of the log variances.
 
-    `grown` holds, for each variance v, the matrix v V^-1 dV/dv of the covariance V.
+    `grown` holds, for each variance v, the matrix v V^-1 dV/dv, where V is the covariance.
     """
     return np.array([[0.5 * np.sum(a * b.T) for b in grown] for a in grown])
 
@@ -356,7 +358,8 @@ def pooled_stds(precision: Square, z: Search, objective: Objective, log_v: Varia
             - np.log(np.diag(root)).sum()
             - len(at) * np.log(part * typical)
             - 0.5 * part**2
-            + np.log(part)  # grid steps grow with the std
+            # The grid is geometric: a candidate stands for an interval in proportion to its std.
+            + np.log(part)
         )
     weight = np.exp(np.array(log) - max(log))
     return PooledStds(_GRID * typical, weight / weight.sum())

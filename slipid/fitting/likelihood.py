@@ -1,9 +1,10 @@
-"""Predictions of a robot for every segment of every run, and their residuals to the measurements.
+"""Predictions of a robot model for every segment of every run, and their residuals.
 
-A segment is a few neighbouring windows of one run. The weighting of residuals is in `noise`.
+A segment is a few neighbouring windows of one run. A residual is the prediction less the
+measurement. `slipid.fitting.noise` weights the residuals.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,11 +14,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.data.windows import Windows
-from slipid.model import se2
+from slipid.model import contact, se2
+from slipid.model.geometry import WheelFrame
 from slipid.model.robot import GRAVITY, Robot
 
 Marker = Float[Array, "segment window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
+NearTwists = Marker | Float[np.ndarray, "segment window 3"]
+"""Twists from which the root finder starts, NaN where none is known."""
 PerDrive = Float[Array, "segment window drive"]
 MotorForce = Float[Array, "segment window drive 2"]
 """Forces of `model.robot.Standing.motor_forces` [mu m g], summed over the wheels of every drive."""
@@ -27,7 +31,7 @@ Std = Float[Array, ""] | float
 SMOOTHING_A = 0.03
 """Current magnitude below which the prediction of an unsigned current is smoothed [A]."""
 ROUNDING_VARIANCE = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
-"""Variance added to every residual for the rounding of the logs, by the kind of residual.
+"""Variance added to every residual for the rounding of the logs, keyed by the kind of residual.
 
 `motion` [m^2] or [rad^2], `current` [A^2], `voltage` [V^2]."""
 
@@ -35,7 +39,7 @@ _AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "cur
 
 
 def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
-    """Return the value of function `of` at vector z and its derivative by z, evaluated together."""
+    """Return the value of function `of` at vector z, and its derivative with respect to z."""
     slope, value = jax.jacfwd(lambda x: (of(x),) * 2, has_aux=True)(z)
     return value, slope
 
@@ -43,7 +47,7 @@ def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Arr
 class Batch(eqx.Module):
     """Windows as arrays for compiled functions; names of floors, loads and sessions are indices.
 
-    The indices are those of the robot's stacked numbers. `surface` holds the floor under the whole
+    The indices refer to the robot's stacked parameters. `surface` holds the floor under the whole
     robot (segment,), or under each of its wheels in every window (segment, window, wheel). The
     other fields are those of `slipid.data.windows.Windows`.
     """
@@ -64,6 +68,12 @@ class Batch(eqx.Module):
     signed: bool = eqx.field(static=True)
 
 
+def indices(of: Callable[[str], int], names: Sequence[str]) -> Int[np.ndarray, " name"]:
+    """Return the index of every name; function `of` is called once for each different name."""
+    index = {name: of(name) for name in set(names)}
+    return np.array([index[name] for name in names], int)
+
+
 def batch(
     windows: Windows, robot: Robot, floor: Int[np.ndarray, "segment window wheel"] | None = None
 ) -> Batch:
@@ -72,11 +82,11 @@ def batch(
     `floor` is the surface under each wheel in every window, for windows on several floors.
     """
     if floor is None:
-        floor = np.asarray([robot.surface_index(s) for s in windows.surface])
+        floor = indices(robot.surface_index, windows.surface)
     return Batch(
         surface=jax.device_put(floor),
-        load=jax.device_put(np.array([robot.load_index(s) for s in windows.load])),
-        session=jax.device_put(np.array([robot.session_index(s) for s in windows.session])),
+        load=jax.device_put(indices(robot.load_index, windows.load)),
+        session=jax.device_put(indices(robot.session_index, windows.session)),
         **{name: jax.device_put(np.asarray(getattr(windows, name))) for name in _AS_THEY_ARE},
         has_current=windows.has_current,
         has_voltage=windows.has_voltage,
@@ -92,8 +102,8 @@ class ElectricNoise(eqx.Module):
         scatter: variance of the true current of every window around the predicted current [A^2],
             without the ammeter's noise.
         resistance: winding resistance R [ohm], which converts the uncertainty of the true current
-            to a voltage. It is fixed during every round of a fit, as the variances are: these are
-            fitted to the size of the residuals, which therefore has no further information about R.
+            to a voltage. It stays fixed during a round of a fit, as the variances do: the variances
+            are fitted to the size of the residuals, so that this size cannot inform about R too.
     """
 
     voltage_std: Std
@@ -121,19 +131,40 @@ def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
 
 
 @eqx.filter_jit
-def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
+def predict(robot: Robot, b: Batch, near: NearTwists | None = None) -> Predicted:
     """Return the motion and motor forces of every window at its contact equilibrium.
 
-    `near` holds twists close to the equilibria, as in `model.contact.equilibrium`.
+    `near` holds twists close to the equilibria, which are then found about ten times sooner. Where
+    the root finder does not converge from there, as from NaN, all are found without `near`.
     """
-    frame = robot.geometry.frame()
+    frame, w = robot.geometry.frame(), wheel_speed(robot, b)
+    still = jax.lax.stop_gradient((robot, frame, w, b, near))
 
-    def window(w: Array, near: Array | None, surface: Array, load: Array) -> Array:
-        return robot.standing(frame, surface, load).twist(frame.at_wheels(w), near)
+    def attached(w: Array, xi: Array, surface: Array, load: Array) -> Array:
+        on = robot.standing(frame, surface, load)
+        return contact.differentiable(on.contact(frame.at_wheels(w)), xi)
 
-    twist = each_window(window, b, wheel_speed(robot, b), near)
+    twist = each_window(attached, b, w, _roots(*still))
     increment = marker_increments(robot, twist, b.dt, b.session)
     return Predicted(increment, twist, motor_forces(robot, b, twist))
+
+
+def _roots(
+    robot: Robot, frame: WheelFrame, w: PerDrive, b: Batch, near: NearTwists | None
+) -> Marker:
+    """Return the twist of every window, without derivatives; `near` is as in `predict`."""
+
+    def window(w: Array, near: Array | None, surface: Array, load: Array) -> Array:
+        problem = robot.standing(frame, surface, load).contact(frame.at_wheels(w))
+        return contact.root(problem) if near is None else contact.root_near(problem, near)
+
+    def from_anywhere() -> Marker:
+        return each_window(window, b, w)
+
+    if near is None:
+        return from_anywhere()
+    found = each_window(window, b, w, near)
+    return jax.lax.cond(jnp.all(jnp.isfinite(found)), lambda: found, from_anywhere)
 
 
 @eqx.filter_jit
@@ -148,7 +179,9 @@ def motor_forces(robot: Robot, b: Batch, twist: Marker) -> MotorForce:
     return each_window(window, b, wheel_speed(robot, b), twist)
 
 
-def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | None = None) -> Any:
+def each_window(
+    of: Callable[..., Any], b: Batch, w: PerDrive, near: NearTwists | None = None
+) -> Any:
     """Return the results of function `of` for every window, with axes (segment, window, ...).
 
     `of` takes the wheel speeds of a window [rad/s], its element of `near` or None, and the indices
@@ -157,8 +190,8 @@ def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | No
     """
     segments, windows = b.dt.shape
 
-    def flat(x: Array) -> Array:
-        return x.reshape(segments * windows, *x.shape[2:])
+    def flat(x: Array | np.ndarray) -> Array:
+        return jnp.asarray(x).reshape(segments * windows, *x.shape[2:])
 
     def of_segment(x: Array) -> Array:
         return jnp.repeat(x, windows, axis=0, total_repeat_length=segments * windows)
@@ -186,9 +219,8 @@ def marker_increments(
 @eqx.filter_jit
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
     """Return the predicted motor current of every window [A]; its magnitude for unsigned logs."""
-    friction = robot.surfaces.friction[
-        b.surface
-    ]  # Forces are divided by mu m g averaged over the wheels.
+    # `motor_force` is in units of mu m g with mu averaged over the wheels; `weight` is that unit.
+    friction = robot.surfaces.friction[b.surface]
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * GRAVITY
     torque = (
@@ -228,8 +260,8 @@ def electric_residuals(
     """Return predicted less measured `current` [A] and `voltage`, as far as they are logged.
 
     The voltage residual [V] is divided by `voltage_spread`. Voltages are predicted from the
-    expected true current, given the measured and the predicted current. If the measured current
-    were used alone, its noise would bias R towards small values.
+    expected true current, given the measured and the predicted current. If only the measured
+    current were used, its noise would bias R towards small values.
     """
     if not b.has_current:
         return {}
@@ -256,7 +288,7 @@ def _direction(b: Batch) -> PerDrive:
 
 
 def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
-    """Return the regression factor k from measured to true current, and the variance that remains.
+    """Return the regression factor k from measured to true current, and the remaining variance.
 
     The true current is N(predicted, s^2) before it is measured with noise of variance sigma^2.
     After the measurement it is N(predicted + k (measured - predicted), k sigma^2) with
@@ -272,9 +304,9 @@ def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDr
 def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, Array]:
     """Return log |d residuals / d data| of motion and of voltages, one value per segment each.
 
-    Both depend on fitted numbers: measured positions are corrected by the camera model, and voltage
-    residuals are divided by `voltage_spread`. Without these terms of the likelihood, numbers that
-    shrink the residuals would seem to fit better.
+    Both depend on fitted parameters: measured positions are corrected by the camera model, and
+    voltage residuals are divided by `voltage_spread`. Without these terms, the likelihood would
+    rise for parameter values that merely shrink all residuals, such as a small camera scale.
     """
     camera = camera_log_jacobian(robot, b.pose)
     if not (b.has_current and b.has_voltage):
@@ -286,7 +318,7 @@ def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, 
 def camera_log_jacobian(
     robot: Robot, pose: Float[Array, "segment edge 3"]
 ) -> Float[Array, " segment"]:
-    """Return log |d motion residuals / d logged poses| of every segment, its first pose fixed."""
+    """Return log |d motion residuals / d logged poses| of segments whose first pose is fixed."""
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 

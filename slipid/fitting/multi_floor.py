@@ -120,7 +120,7 @@ def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> MultiFloorRuns:
 
 
 def _short(data: Runs, radius: float, lag: float) -> Windows:
-    """Return the windows of every run, each as a separate segment; arguments as in `windows`."""
+    """Cut every run into short windows, each a separate segment; arguments as in `windows`."""
     each = []
     for k in range(len(data)):
         t = data.time[data.rows(k)]
@@ -130,7 +130,7 @@ def _short(data: Runs, radius: float, lag: float) -> Windows:
 
 
 def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Windows:
-    """Return several sets of windows as one; `run` is the new run index of every segment."""
+    """Concatenate sets of windows; `run` is the new run index of every segment."""
     whole: dict[str, Any] = {"run": run}
     for name in (f.name for f in fields(Windows) if f.name != "run"):
         values = [getattr(w, name) for w in each]
@@ -142,10 +142,14 @@ def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Window
 
 
 def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "segment time wheel 2"]:
-    """Return wheel centres at start, middle and end of the single window of every segment [m]."""
+    """Return positions of the wheel centres in the frame of the map [m].
+
+    They are given at the start, middle and end of the single window of every segment.
+    """
     edges = np.asarray(lk.corrected(robot, jnp.asarray(w.pose)))
     pose = np.stack([edges[:, 0], edges.mean(axis=1), edges[:, 1]], axis=1)
-    yaw = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])
+    session = lk.indices(robot.session_index, w.session)
+    yaw = np.asarray(jax.vmap(robot.camera.yaw)(jnp.asarray(session)))
     heading = pose[..., 2] - yaw[:, None]
     c, s = np.cos(heading), np.sin(heading)
     turn = np.stack([c, -s, s, c], -1).reshape(*c.shape, 2, 2)
@@ -228,8 +232,8 @@ def window_errors(
     """Return root mean square errors over all windows that are used.
 
     Args:
-        judged: sets of residuals by block; each set has weight 1 for the segments whose residuals
-            are taken from it, and 0 for the others.
+        judged: pairs of residuals, keyed by block, and weights: 1 for the segments whose errors are
+            taken from these residuals, 0 for all other segments.
     """
     counts, dt = np.asarray(multi_floor.counts), np.asarray(multi_floor.batch.dt)
     motion, current, total = np.zeros(3), 0.0, 0.0

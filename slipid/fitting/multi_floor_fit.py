@@ -1,7 +1,7 @@
 """Fit of runs over several floors together with the runs on one floor each.
 
-The runs over several floors are further segments of the same likelihood. Their predictions are
-judged on held-out runs: each half of them is predicted by a fit to the other half.
+The runs over several floors are further segments of the same likelihood. Predictions are judged on
+held-out runs: each half of the runs over several floors is predicted by a fit to the other half.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
 
 _ROUNDS = 6
-"""Largest number of rounds of each fit to half of the runs, which is only used to judge errors."""
+"""Largest number of rounds of a fit to half of the runs; such a fit only serves to judge errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +32,12 @@ class MultiFloorFit:
     Attributes:
         problem: problem of all runs.
         optimum: optimum of all runs.
-        before: errors on the runs over several floors, predicted by the fit without any of them.
-        after: errors if each half of them is predicted by a fit to the other half; None if there is
-            only one run.
-        learnt: errors on the same runs, predicted by the fit to all runs.
-        as_if: errors, by floor, of predictions as if all wheels had always stood on this floor; a
-            correct map predicts better.
+        before: errors on the runs over several floors, predicted by the fit to all other runs.
+        after: errors on the runs over several floors, each half of which is predicted by a fit to
+            the other half; None if there is only one run.
+        learnt: errors on the runs over several floors, predicted by the fit to all runs.
+        as_if: errors, keyed by floor, if `learnt` is predicted as if all wheels always stood on
+            that floor; they exceed those of `learnt` if the map is correct.
     """
 
     problem: Problem
@@ -56,7 +56,7 @@ def fit_multi_floor(
     most_rounds: int = 30,
     tolerance: float = 0.02,
 ) -> MultiFloorFit:
-    """Return the fit to all runs, continued from the optimum of the runs on one floor each.
+    """Fit all runs together, starting at the optimum of the runs on one floor each.
 
     `tell` is called after every round of the fit to all runs; `most_rounds` and `tolerance` are
     those of `optimise`.
@@ -66,7 +66,7 @@ def fit_multi_floor(
     odd = np.unique(multi_floor.windows.run, return_inverse=True)[1] % 2 == 1
     objective, every = whole.objective, np.ones(len(odd))
     batch = objective.multi_floor
-    assert batch is not None, "runs over several floors"
+    assert batch is not None, "`with_multi_floor` sets the batch of runs over several floors"
 
     def errors(
         of: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]

@@ -7,10 +7,10 @@ The residuals of a segment have the covariance
                          individual effect of the run along, across and in yaw, per floor
 
 with variances v_c and matrices B_c, so that the run effects are marginalised. Runs over several
-floors have separate variances, as if they were driven on one more floor. Two kinds of variances are
-listed with these but are not part of V: those of effects that runs share
-(`slipid.fitting.shared_effects`), and that of the load biases of floors. Known variances, such as
-the ammeter's noise, are added.
+floors have separate variances, as if they were driven on one more floor. Known variances, such as
+the ammeter's noise, are added. The list of components also contains variances that are not part of
+V: those of effects that runs share (`slipid.fitting.shared_effects`), and that of the load biases
+of floors.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.windows import Windows
-from slipid.fitting.likelihood import ROUNDING_VARIANCE, Batch, ElectricNoise, voltage_std
+from slipid.fitting.likelihood import (
+    ROUNDING_VARIANCE,
+    Batch,
+    ElectricNoise,
+    indices,
+    voltage_std,
+)
 from slipid.fitting.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION, MultiFloorRuns
 from slipid.model.robot import Robot
 
@@ -54,7 +60,7 @@ class Components(eqx.Module):
 
     @property
     def single(self) -> Float[Array, "segment component m"]:
-        """Derivative of the variance of every single residual by the variance of each component."""
+        """Derivative of each residual's variance with respect to the variance of each component."""
         return jnp.diagonal(self.base, axis1=-2, axis2=-1)
 
 
@@ -88,7 +94,7 @@ class NoiseModel:
 
     Attributes:
         components: descriptions of the components, in the order of the vector of variances.
-        blocks: covariance terms of each block of residuals, by the name of the block.
+        blocks: covariance terms of each block of residuals, keyed by the name of the block.
     """
 
     components: tuple[Component, ...]
@@ -120,13 +126,13 @@ _MULTI_FLOOR = (
 SHARED = {"neighbours": 0.5, "session": 0.3}
 """Kinds of effects that runs share, with the ratio of their typical std to that of run effects."""
 POOLED = "pooled.load_bias"
-"""Name of the prior variance that the load biases of all floors have in common."""
+"""Name of the component that is the common prior variance of the load biases of all floors."""
 
 
 def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = None) -> NoiseModel:
-    """Return the noise model of these windows; distances and directions come from the encoders.
+    """Return the noise model of windows; distances and directions come from the encoders.
 
-    The segments of runs over several floors follow those of the windows in the order of segments.
+    The segments of `multi_floor`, if given, are counted after those of `windows`.
     """
     floors = robot.surfaces.labels
     table = [
@@ -141,7 +147,7 @@ def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = N
         for floor in several_sessions if kind == "session" else floors:
             table += [Component(kind, what, floor, u, part * v) for what, u, v in _EFFECT]
     table.append(Component("pooled", "load_bias", None, "1", 0.05))
-    on = np.array([[robot.surface_index(s)] for s in windows.surface])
+    on = indices(robot.surface_index, windows.surface)[:, None]
     blocks = {"motion": _motion_components(windows, robot, 2 + 6 * on)}
     if multi_floor is not None:
         table += _multi_floor_components(multi_floor, robot, len(windows), len(table), blocks)
@@ -170,7 +176,7 @@ def electric_noise(
     log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"],
     resistance: Array,
 ) -> ElectricNoise:
-    """Return the noise that predictions of voltages depend on; a placeholder without voltages."""
+    """Return the noise that predicted voltages depend on; a placeholder if none are logged."""
     if "voltage" not in blocks:
         return ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
     current, log_v = blocks["current"], jnp.asarray(log_variance)
@@ -187,7 +193,7 @@ def _multi_floor_components(
 ) -> list[Component]:
     """Return the components of runs over several floors, and add their blocks to `blocks`.
 
-    `segments` and `start` are the indices of their first segment and of their first variance.
+    `segments` is the index of these runs' first segment, `start` that of their first variance.
     """
     w, none = multi_floor.windows, np.zeros((len(multi_floor.windows), 1), int)
     table = [
@@ -209,7 +215,7 @@ def _counted(of: Components, live: Bool[np.ndarray, "segment m"], first: int) ->
     """Return covariances in which unused residuals have variance 1 and no correlation.
 
     Args:
-        live: True for residuals that are used; the others are set to zero elsewhere.
+        live: True for residuals that are used; `MultiFloorBatch.residuals` sets all others to zero.
         first: index of the first segment among all segments of the problem.
     """
     both = live[:, None, :, None] & live[:, None, None, :]
@@ -254,7 +260,7 @@ def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarr
     """Return the distance of each window by the encoders (segment, window) [m], and its direction.
 
     The distance includes the turn in radians times the base radius. The direction is a unit vector
-    in the body frame (segment, window, 2), ahead if the robot turns on the spot.
+    in the body frame (segment, window, 2); it is (1, 0) if the robot turns on the spot.
     """
     step = encoder_increments(windows, robot)
     distance = np.linalg.norm(step[..., :2], axis=-1)

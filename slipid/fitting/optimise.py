@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from slipid.fitting.problem import (
     FitState,
     GivenMotion,
     Problem,
+    Twists,
     effects_given,
     linear,
     linear_given,
@@ -118,9 +120,9 @@ def one_round(
     """
     objective, log_v = problem.objective, jnp.asarray(state.log_variance)
     electric = problem.electric(state.z, log_v)
-    residual, _, motor_force = linear(objective, jnp.asarray(state.z), electric)
+    start = linear(objective, jnp.asarray(state.z), electric)
     before = state.shared(len(problem.windows))
-    weighed = problem.weighed(residual, log_v, keep, before)
+    weighed = problem.weighed(start.residual, log_v, keep, before)
     root = weighed.whitening.root
     fixed = RoundInputs(
         objective=objective,
@@ -130,12 +132,13 @@ def one_round(
         effects=weighed.effects,
         prior_std=objective.prior_std(log_v),
         electric=electric,
-        motor_force=motor_force,
+        motor_force=start.motor_force,
         slope=log_jacobian(objective, state.z, electric, keep)[1],
     )
-    z = levenberg(fixed, steps)
+    y, near = levenberg(partial(linearised, fixed), len(state.z), start.twists, steps)
+    z = np.asarray(_at(fixed, y))
     electric = problem.electric(z, log_v)
-    whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
+    whole, jacobian, motor_force, near = linear(objective, jnp.asarray(z), electric, near)
     effect = effects_given(weighed.effects, root["motion"], whole["motion"])
     # Weights and effects depend on each other, and full steps of both could oscillate forever.
     effect = 0.5 * (effect + before) if state.round else effect
@@ -157,7 +160,7 @@ def one_round(
         voltage is not None and scoring
     ):  # A changed noise does not merely rescale the derivative by R.
         electric = problem.electric(z, log_v)
-        whole, jacobian = problem.linear(z, electric)
+        whole, jacobian, *_ = linear(objective, jnp.asarray(z), electric, near)
     information = np.asarray(problem.precision(jacobian, log_v, keep))
     covariance = np.linalg.inv(information)
     if scoring:
@@ -267,18 +270,27 @@ class RoundInputs(eqx.Module):
 
 
 class LinearisedResiduals(NamedTuple):
-    """Whitened residuals of all blocks and of the prior, and their derivative by the step."""
+    """Whitened residuals of all blocks and of the prior, their derivative by the step, and twists.
+
+    Attributes:
+        residual: whitened residuals.
+        jacobian: their derivatives with respect to the step.
+        twists: body twists of all windows.
+    """
 
     residual: Float[np.ndarray, " row"]
     jacobian: Float[np.ndarray, "row free"]
+    twists: Twists
 
     @property
     def loss(self) -> float:
         return 0.5 * float(self.residual @ self.residual)
 
 
-def levenberg(fixed: RoundInputs, steps: int) -> Search:
-    """Return the search vector after steps of the Levenberg-Marquardt method, fixed whitening.
+def levenberg(
+    linearised: Callable[[Search, Twists], LinearisedResiduals], size: int, near: Twists, steps: int
+) -> tuple[Search, Twists]:
+    """Return the vector after steps of the Levenberg-Marquardt method from zero, and its twists.
 
     A step is accepted if it lowers the loss by at least 1 % of what the linear model predicts, and
     the damping then falls if the model is right to 1 %; it rises after a refused step. Refused
@@ -289,17 +301,18 @@ def levenberg(fixed: RoundInputs, steps: int) -> Search:
     take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for the constants.
 
     Args:
+        linearised: function that returns the residuals at a vector, given twists near its own.
+        size: number of coordinates of the vector.
+        near: twists near those at zero.
         steps: largest number of accepted steps.
     """
-    y = np.zeros(len(fixed.z))
-    at, length, accepted = linearised(fixed, y), 1.0, 0
+    y = np.zeros(size)
+    at, length, accepted = linearised(y, near), 1.0, 0
     for _ in range(steps + _MOST_REFUSED - 1):
         a = at.jacobian.T @ at.jacobian + np.eye(len(y)) / length
         step = -np.linalg.solve(a, at.jacobian.T @ at.residual)
-        predicted = (
-            LinearisedResiduals(at.residual + at.jacobian @ step, at.jacobian).loss - at.loss
-        )
-        new = linearised(fixed, y + step)
+        predicted = at._replace(residual=at.residual + at.jacobian @ step).loss - at.loss
+        new = linearised(y + step, at.twists)
         if not new.loss - at.loss <= 0.01 * predicted:
             length *= 0.25
             continue
@@ -308,7 +321,7 @@ def levenberg(fixed: RoundInputs, steps: int) -> Search:
         y, at, accepted = y + step, new, accepted + 1
         if settled or accepted >= steps:
             break
-    return np.asarray(_at(fixed, y))
+    return y, at.twists
 
 
 def _alike(new: np.ndarray, old: np.ndarray) -> bool:
@@ -321,12 +334,16 @@ def _at(fixed: RoundInputs, y: Vector) -> Vector:
     return fixed.z + fixed.mask * fixed.prior_std * y
 
 
-def linearised(fixed: RoundInputs, y: Search) -> LinearisedResiduals:
-    """Return whitened residuals and their derivative after a step `y` from the start."""
+def linearised(fixed: RoundInputs, y: Search, near: Twists) -> LinearisedResiduals:
+    """Return whitened residuals and their derivative after a step `y` from the start.
+
+    `near` holds the twists of all windows after a similar step.
+    """
     z = _at(fixed, y)
     given = GivenMotion(np.array(True), fixed.z, fixed.motor_force)
-    residual, jacobian, _ = linear_given(fixed.objective, z, fixed.electric, given)
-    return LinearisedResiduals(*map(np.asarray, _stacked(fixed, residual, jacobian, z)))
+    found = linear_given(fixed.objective, z, fixed.electric, given, near)
+    rows, slopes = _stacked(fixed, found.residual, found.jacobian, z)
+    return LinearisedResiduals(np.asarray(rows), np.asarray(slopes), found.twists)
 
 
 @eqx.filter_jit

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
@@ -317,20 +317,61 @@ class GivenMotion(eqx.Module):
     motor_force: lk.MotorForce | Float[np.ndarray, "segment window drive 2"]
 
 
+class Twists(NamedTuple):
+    """Body twists of all windows, from which the root finder starts at the next search vector.
+
+    NaN stands for twists that are not known.
+
+    Attributes:
+        steady: twists of the windows on one floor.
+        multi_floor: twists of the windows of runs over several floors, None without such runs.
+        electric: the same with the electric numbers of `GivenMotion` replaced.
+    """
+
+    steady: lk.NearTwists
+    multi_floor: lk.NearTwists | None
+    electric: lk.NearTwists | None
+
+    @classmethod
+    def unknown(cls, objective: Objective) -> "Twists":
+        """Return NaN for all windows of an objective."""
+        none, of = np.full((*objective.batch.dt.shape, 3), np.nan), objective.multi_floor
+        more = None if of is None else np.full((*of.batch.dt.shape, 3), np.nan)
+        return cls(none, more, more)
+
+
+class Linearised(NamedTuple):
+    """Residuals at a search vector.
+
+    Attributes:
+        residual: residual blocks (segment, m).
+        jacobian: their derivatives with respect to the search vector (segment, m, free).
+        motor_force: forces of every motor [mu m g].
+        twists: body twists of all windows.
+    """
+
+    residual: Blocks
+    jacobian: Blocks
+    motor_force: Array
+    twists: Twists
+
+
 def linear(
-    objective: Objective, z: Vector, electric: lk.ElectricNoise
-) -> tuple[Blocks, Blocks, Array]:
-    """Return residual blocks, their Jacobians, and the forces of every motor."""
+    objective: Objective, z: Vector, electric: lk.ElectricNoise, near: Twists | None = None
+) -> Linearised:
+    """Return residual blocks, their Jacobians, and the forces of every motor.
+
+    `near` holds the twists at a search vector close to z, which make the root finder faster.
+    """
     no_force = np.zeros((*objective.batch.turn.shape, 2))
-    return linear_given(
-        objective, z, electric, GivenMotion(np.array(False), np.zeros(len(z)), no_force)
-    )
+    given = GivenMotion(np.array(False), np.zeros(len(z)), no_force)
+    return linear_given(objective, z, electric, given, near or Twists.unknown(objective))
 
 
 @eqx.filter_jit
 def linear_given(
-    objective: Objective, z: Vector, electric: lk.ElectricNoise, given: GivenMotion
-) -> tuple[Blocks, Blocks, Array]:
+    objective: Objective, z: Vector, electric: lk.ElectricNoise, given: GivenMotion, near: Twists
+) -> Linearised:
     """Return residual blocks, their Jacobians, and the forces of every motor.
 
     Both kinds of electric residuals are compiled together: to compile them apart would take longer
@@ -338,10 +379,10 @@ def linear_given(
     """
     space, batch = objective.space, objective.batch
 
-    def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
+    def blocks(x: Array) -> tuple[Blocks, Linearised]:
         robot = space.tree(x)
         electrical = space.tree(jnp.where(given.applies & ~space.electric, given.z, x))
-        p = lk.predict(robot, batch)
+        p = lk.predict(robot, batch, near.steady)
         force = jax.lax.cond(
             given.applies,
             lambda: jnp.asarray(given.motor_force),
@@ -349,16 +390,57 @@ def linear_given(
         )
         out = {"motion": lk.motion_residual(robot, batch, p)}
         out |= lk.electric_residuals(electrical, batch, force, electric)
+        twists = Twists(p.twist, None, None)
         if (of := objective.multi_floor) is not None:
             # friction is an electric number that changes the motion of runs over several floors, so
             # that their currents need a prediction of their own
-            out |= of.residuals(electrical, lk.predict(electrical, of.batch))
-            of_robot = of.residuals(robot, lk.predict(robot, of.batch))
-            out[MULTI_FLOOR_MOTION] = of_robot[MULTI_FLOOR_MOTION]
-        return out, (out, force)
+            mine = lk.predict(robot, of.batch, near.multi_floor)
+            theirs = lk.predict(electrical, of.batch, near.electric)
+            out |= of.residuals(electrical, theirs)
+            out[MULTI_FLOOR_MOTION] = of.residuals(robot, mine)[MULTI_FLOOR_MOTION]
+            twists = Twists(p.twist, mine.twist, theirs.twist)
+        return out, Linearised(out, {}, force, twists)
 
-    jacobian, (out, motor_force) = jax.jacfwd(blocks, has_aux=True)(z)
-    return out, jacobian, motor_force
+    direction = np.arange(space.size) if objective.multi_floor else _directions(space)
+
+    def along(change: Array) -> tuple[Blocks, Linearised]:
+        return jax.jvp(blocks, (jnp.asarray(z),), (change,), has_aux=True)[1:]
+
+    changes = (np.arange(direction.max(initial=-1) + 1)[:, None] == direction).astype(float)
+    slopes, found = jax.vmap(along, out_axes=(-1, None))(changes)
+    if not objective.multi_floor:
+        concerns = _concerns(space, batch)[:, None]
+        slopes = {k: jnp.where(concerns, s[..., direction], 0.0) for k, s in slopes.items()}
+    return found._replace(jacobian=slopes)
+
+
+def _directions(space: Space) -> Int[np.ndarray, " free"]:
+    """Return the index of the direction in which the derivative is taken for each coordinate.
+
+    A segment is on one floor, with one load set-up, in one session. Coordinates that differ only in
+    these are changed together: for each segment, the derivative is that of the one coordinate that
+    concerns it. Source: Curtis, Powell and Reid 1974, IMA J. Appl. Math. 13(1).
+    """
+    of = [(e.quantity, k) for e in space.free for k in range(e.coordinates)]
+    index = {key: number for number, key in enumerate(dict.fromkeys(of))}
+    return np.array([index[key] for key in of], int)
+
+
+def _concerns(space: Space, batch: lk.Batch) -> Bool[Array, "segment free"]:
+    """Return True for the coordinates of a segment's floor, load set-up, session, or of all."""
+    tree = space.template
+    out = jnp.ones((len(batch.surface), space.size), bool)
+    for label, names, of in (
+        ("surface", tree.surfaces.labels, batch.surface),
+        ("load", tree.body.loads, batch.load),
+        ("session", tree.camera.sessions, batch.session),
+    ):
+        mine = np.repeat(
+            [names.index(getattr(e, label)) if getattr(e, label) else -2 for e in space.free],
+            [e.coordinates for e in space.free],
+        )
+        out &= (mine == -2) | (mine == of[:, None])
+    return out
 
 
 @eqx.filter_jit

@@ -1,18 +1,21 @@
-"""Effects common to the runs of one session beyond the model, and the resulting larger covariance.
+"""Effects that the runs of one session share beyond the model, and the covariance with them.
 
 Runs driven on one floor in one session all slip a little more, or all a little less, than the model
-predicts. The slip models of the comparison are fitted as if runs were independent. After such a fit
-the remaining effects of its runs,
+predicts. The slip models of the comparison are fitted as if runs were independent. After such a
+fit, run i has the remaining effects
 
     a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i     along, across, yaw
 
-have a part that is common to the session. E_i is the change of the residuals r_i per unit of an
-effect; W_i is the inverse of their covariance without the run effects. The variance v of the common
-part is estimated per floor and axis by restricted likelihood, at fixed variances of the run
-effects. It alternates with the Student-t weights of the runs, so that a run is not down-weighted
-for an effect that its whole session shares. The covariance C of the fitted numbers grows to
+where r_i are its residuals, E_i is their change per unit of an effect, and W_i is the inverse of
+the covariance that r_i has without run effects. A part of a_i is common to the session. Its
+variance v is estimated per floor and axis by restricted likelihood, at fixed variances of the run
+effects. This estimate alternates with the Student-t weights of the runs, so that a run is not
+down-weighted for an effect that its whole session shares. The covariance C of the fitted parameters
+grows to
 
     C + C (sum_s v u_s u_s^T) C,    u_s = sum_{i in s} J_i^T V_i^-1 E_i
+
+with the derivative J_i of r_i with respect to the parameters, and the covariance V_i of r_i.
 """
 
 from collections.abc import Mapping
@@ -27,7 +30,7 @@ from slipid.fitting.shared_effects import AXES
 from slipid.fitting.variances import DEGREES
 
 LOG_VARIANCE_STD = 3.0
-"""Std of the prior of a session effect's log variance, centred on that of the run effects."""
+"""Prior std of a session effect's log variance; the prior mean is that of the run effects."""
 ROUNDS = 4
 """Number of alternations between weights and variances."""
 
@@ -38,9 +41,9 @@ class LinearModel:
 
     Attributes:
         gap: predicted less measured increments.
-        slope: derivative of the increments by the fitted numbers.
-        covariance: covariance of the fitted numbers.
-        wide: covariance of the fitted numbers before the floor's own runs were used.
+        slope: derivative of the increments with respect to the fitted parameters.
+        covariance: covariance of the fitted parameters.
+        wide: covariance of the fitted parameters before the floor's own runs were used.
         scale: noise covariance of `gap`, including the individual effect of the run.
         effect: change of the increments per unit of an effect along, across and in yaw.
         run: variance of the individual effects of runs along, across and in yaw.
@@ -58,10 +61,10 @@ class LinearModel:
 def with_session_effects(
     model: LinearModel, w: Windows, keep: Float[np.ndarray, " segment"]
 ) -> tuple[dict[str, float], Float[np.ndarray, "number number"]]:
-    """Return variances `session.<floor>.<axis>`, and the numbers' covariance that includes them.
+    """Return variances keyed `session.<floor>.<axis>`, and the parameter covariance with them.
 
     A floor driven in only one session has no such variances: the common effect of its runs is then
-    part of the floor's fitted numbers.
+    part of the floor's fitted parameters.
     """
     variance: dict[str, float] = {}
     for _ in range(ROUNDS):
@@ -82,7 +85,7 @@ def with_session_effects(
 def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "segment 3"]:
     """Return the variances of one kind of effect along, across and in yaw, for every segment.
 
-    They are zero if `variance` has no entry `<kind>.<floor>.<axis>`.
+    A variance is zero if `variance` has no key `<kind>.<floor>.<axis>`.
     """
     return np.array([on_floor(variance, kind, floor) for floor in w.surface])
 
@@ -93,7 +96,7 @@ def on_floor(
     floor: str,
     default: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Float[np.ndarray, "3"]:
-    """Return the values `<kind>.<floor>.<axis>` along, across and in yaw."""
+    """Return the values keyed `<kind>.<floor>.<axis>` along, across and in yaw, or `default`."""
     names = [f"{kind}.{floor}.{axis}" for axis in AXES]
     return np.array([values.get(name, usual) for name, usual in zip(names, default, strict=True)])
 
@@ -101,7 +104,7 @@ def on_floor(
 def _variances(
     model: LinearModel, w: Windows, keep: np.ndarray, weight: np.ndarray
 ) -> dict[str, float]:
-    """Return the variances of session effects by name, at given weights of the segments."""
+    """Return the variances of session effects, keyed by name, at given weights of the segments."""
     session, floor = np.asarray(w.session), np.asarray(w.surface)
     left, noise, slope = remaining_effects(
         model.gap, model.slope, model.scale, model.effect, model.run
@@ -138,7 +141,8 @@ def remaining_effects(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return remaining effects of each run (run, 3), their noise variances, and their derivative.
 
-    The derivative is by the fitted numbers (run, 3, number). Arguments are those of `LinearModel`.
+    The derivative (run, 3, number) is with respect to the fitted parameters. The arguments are
+    attributes of `LinearModel`.
     """
     plain = scale - np.einsum("nma,na,nla->nml", effect, run, effect)
     by_noise = np.linalg.solve(plain, effect)
@@ -153,7 +157,7 @@ def _variance(left: np.ndarray, own: np.ndarray, member: np.ndarray, centre: flo
 
     Args:
         left: remaining effects of the runs.
-        own: their covariance without shared effects.
+        own: covariance of `left` without shared effects.
         member: 1 if a run belongs to a session, else 0 (run, session).
         centre: centre of the prior of the log variance.
     """

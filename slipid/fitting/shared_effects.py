@@ -9,15 +9,16 @@ d is a Gaussian process per floor and axis, with a kernel that is periodic in th
 travel relative to the body; s is one number per floor, axis and session; `own` is part of the noise
 of the run. A robot whose wheels are symmetric about an axis has symmetric errors in directions that
 mirror each other: of the same sign along the direction of travel, of opposite sign across it and in
-yaw. The kernel is therefore k(a, b) = k0(a - b) +- h k0(a + b), with angles from the mirror axis.
+yaw. The kernel is therefore k(a, b) = k0(a - b) +- h k0(a + b), with angles a, b from the mirror
+axis; + holds along, - across and in yaw.
 
-With r the residuals of a floor's runs, whitened by roots W of their own noise, and coefficients u
-of unit variance, e = S u, the effects are marginalised:
+The effects of a floor's runs are e = S u with coefficients u of unit variance. With the residuals r
+of these runs, the matrix W that whitens r without shared effects, and the change E of r per unit of
+an effect, the coefficients are marginalised:
 
     min over u of |W (r - E S u)|^2 + |u|^2,    u^ = C^-1 (W E S)^T W r,    C = 1 + (W E S)^T W E S
 
-where E is the change of the residuals per unit of an effect. Source: Rasmussen and Williams 2006,
-section 2.7.
+Source: Rasmussen and Williams 2006, section 2.7.
 """
 
 from collections.abc import Mapping
@@ -49,7 +50,7 @@ MIRROR_CORRELATION = 0.7
 _HARMONICS = 15
 """Number of harmonics of the kernel over directions; higher ones hold 1 % of its variance."""
 _SPEED_STEP = 0.25
-"""Step to which natural logarithms of speed are rounded."""
+"""Natural logarithms of speeds are rounded to multiples of this."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class SpeedAndLoad:
     """A speed and a load set-up that were driven on a floor.
 
     Attributes:
-        log_speed: natural logarithm of the speed in m/s, rounded to `_SPEED_STEP`.
+        log_speed: natural logarithm of the speed in m/s, rounded to a multiple of `_SPEED_STEP`.
         load: load set-up.
     """
 
@@ -79,7 +80,7 @@ class TravelConditions:
     Attributes:
         direction: direction of travel relative to the body [rad], nan if a robot turns on the spot.
         speed_and_load: speed and load set-up.
-        mirror: axis of `Geometry.mirror`.
+        mirror: angle of the axis about which the wheels are symmetric [rad], or None.
     """
 
     direction: Float[np.ndarray, " segment"]
@@ -109,7 +110,7 @@ class TravelConditions:
     def around(self) -> Float[np.ndarray, "3 segment harmonic"]:
         """Return a root of the kernel over directions for each axis: root root^T is the kernel.
 
-        Rows are zero where the robot turns on the spot.
+        Rows of segments in which the robot turns on the spot are zero.
         """
         mirrored = 0.0 if self.mirror is None else MIRROR_CORRELATION
         wave = 1 / DIRECTION_LENGTH**2
@@ -126,10 +127,11 @@ class TravelConditions:
         return np.stack(root) * np.isfinite(self.direction)[:, None]
 
     def basis(self, known: tuple[SpeedAndLoad, ...]) -> Float[np.ndarray, "3 segment coef"]:
-        """Return a root of the whole kernel: effects per unit coefficient, for fitted conditions.
+        """Return a root of the kernel over directions, speeds and loads: effects per coefficient.
 
-        `known` are the speeds and loads for which there are coefficients. A row has the same norm
-        as that of `around` if its speed and load are among them, else a smaller norm.
+        `known` are the fitted speeds and loads, for which there are coefficients. The row of a
+        segment has the norm of its row of `around` if `known` contains the segment's speed and
+        load, else a smaller norm.
         """
         if not known:
             return np.zeros((len(AXES), len(self.speed_and_load), 0))
@@ -150,10 +152,11 @@ class SharedEffects(eqx.Module):
 
     Attributes:
         segments: indices of the floor's segments.
-        effect: change of their residuals per unit of an effect along, across and in yaw.
+        effect: change of these segments' residuals per unit of an effect along, across and in yaw.
         near: root of the kernel over driving conditions, by axis and segment.
         session: 1 in the column of each segment's session, else 0.
-        numbers: indices of the variances (own, neighbours', session; axis), -1 if there is none.
+        numbers: indices of the variances; rows are run, neighbours' and session effects, columns
+            the axes; -1 if there is no such variance.
     """
 
     segments: Int[Array, " run"]
@@ -173,7 +176,7 @@ class SharedEffects(eqx.Module):
 
 
 SpeedsAndLoads = dict[str, tuple[SpeedAndLoad, ...]]
-"""Speeds and loads of the runs on each floor, by floor."""
+"""Speeds and loads of the runs on each floor, keyed by floor."""
 
 
 def effects_by_floor(
@@ -239,7 +242,7 @@ def effect_posteriors(
     log_v: Float[Array, " variance"],
     white: Float[Array, "segment m m"],
 ) -> Posteriors:
-    """Return the posterior of the effects of every floor, for whitening roots of all segments."""
+    """Return the posterior of every floor's effects; `white` holds each segment's matrix W."""
 
     def posterior(of: SharedEffects) -> EffectPosterior:
         span = jnp.einsum("nij,nja->nia", white[of.segments], of.effect)
@@ -279,7 +282,7 @@ def mean_effects(
 
 @eqx.filter_jit
 def effect_covariances(posteriors: Posteriors, count: int) -> Float[Array, "segment 3 3"]:
-    """Return the covariance of every segment's shared effects, given the numbers of the model."""
+    """Return the covariance of every segment's shared effects, given the model's parameters."""
     out = jnp.zeros((count, len(AXES), len(AXES)))
     for p in posteriors:
         axes, runs, _ = p.root.shape
@@ -297,12 +300,12 @@ mean_effect_slopes = jax.vmap(mean_effects, in_axes=(None, -1), out_axes=-1)
 
 
 class EffectForecast(NamedTuple):
-    """Shared effects along, across and in yaw that are expected in segments.
+    """Forecast of the shared effects of segments along, across and in yaw.
 
     Attributes:
         mean: mean effects.
-        slope: derivative of the mean by the search vector.
-        covariance: covariance of the effects, given the fitted numbers.
+        slope: derivative of the mean with respect to the search vector.
+        covariance: covariance of the effects, given the fitted parameters.
     """
 
     mean: Float[np.ndarray, "segment 3"]
@@ -315,11 +318,11 @@ class FittedEffects:
     """Fitted effects that neighbouring runs on a floor share (the Gaussian process d).
 
     Attributes:
-        speeds_and_loads: speeds and loads of these runs.
+        speeds_and_loads: speeds and loads of the fitted runs on the floor.
         std: std of the process along, across and in yaw.
-        coefs: mean of its coefficients, which have prior variance 1, at the fit.
-        by_number: derivative of the coefficients by the search vector.
-        covariance: covariance of the coefficients given the fitted numbers.
+        coefs: posterior mean of the coefficients of the process; their prior variance is 1.
+        by_number: derivative of `coefs` with respect to the search vector.
+        covariance: covariance of the coefficients, given the fitted parameters.
     """
 
     speeds_and_loads: tuple[SpeedAndLoad, ...]

@@ -1,8 +1,8 @@
 """Files of a fit: fit.json, its arrays in an npz file named by their hash, and identified.json.
 
-identified.json is made for reading by people. One checksum covers the whole fit. An old fit is
-replaced in one step, the renaming of fit.json: if the process ends before that, the old fit is
-intact, and after that the new one.
+identified.json is a table for people and other programs. One checksum covers the whole fit. The
+renaming of a new fit.json over the old one replaces an old fit in one step: if the process ends
+before that, the folder still holds the old fit, otherwise the new one.
 """
 
 import hashlib
@@ -38,7 +38,7 @@ _SHAPE = ("place", "drive_angle", "roller_angle", "grips", "drive_of", "gear_rat
 
 
 def save(fit: Fit, folder: Path) -> tuple[str, ...]:
-    """Write a fit to a folder, replacing the one there; return the names of the files.
+    """Write a fit to a folder, replacing a fit there, and return the names of the files.
 
     Raises:
         ValueError: a number is not finite; in this case nothing is written.
@@ -52,9 +52,8 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
     content |= {"checksum": checksum(content)}
     table = json_text(identified_json(fit))
     write_bytes(folder / name, arrays)
-    write_bytes(
-        folder / FIT, json_text(content).encode()
-    )  # From here on, the folder contains the new fit.
+    # After this line the folder contains the new fit, so that files of the old one can be deleted.
+    write_bytes(folder / FIT, json_text(content).encode())
     write_identified(folder, json.loads(table))
     for old in folder.glob("fit-????????????.npz"):
         if old.name != name:
@@ -63,7 +62,7 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
 
 
 def write_identified(folder: Path, content: Content) -> None:
-    """Write identified.json beside fit.json, with the checksum of that fit."""
+    """Write identified.json next to fit.json, with the checksum of that fit."""
     fit = read_json(folder / FIT, _RESULT)
     write_bytes(folder / IDENTIFIED, json_text(content | {"fit": fit["checksum"]}).encode())
 
@@ -108,14 +107,16 @@ def _packed(fit: Fit) -> bytes:
 
 
 def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
-    """Return the arrays of a fit; the hash is checked before they are decoded."""
+    """Return the arrays of a fit, after a check of the file's hash."""
     path = folder / file
     try:
         packed = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; expected the arrays of {FIT}") from error
     if hashlib.sha256(packed).hexdigest() != sha256:
-        raise DataError(f"{path}: damaged, its hash differs from the one in {FIT}")
+        raise DataError(
+            f"{path}: damaged, its hash differs from the one in {FIT}; run `slipid identify` again"
+        )
     with np.load(io.BytesIO(packed), allow_pickle=False) as npz:
         return {name: npz[name] for name in npz.files}
 
@@ -135,14 +136,14 @@ def identified_json(fit: Fit) -> Content:
 
 
 def number_json(e: Estimate) -> Content:
-    """Return a number in the form of identified.json."""
+    """Return an estimate in the form of identified.json."""
     shape = [len(e.labels)] if e.labels else []
     known = {k: getattr(e, k) for k in ("std", "interval90", "source", "verdict", "provenance")}
     return {"value": e.value, "unit": e.unit, "shape": shape, "labels": list(e.labels)} | known
 
 
 def curves_json(curves: Mapping[str, SlipCurve]) -> Content:
-    """Return slip curves by floor, as plain values."""
+    """Return slip curves, keyed by floor, as plain values."""
     return {
         floor: {name: getattr(c, name).tolist() for name in _CURVE}
         | {"at": {"wheel_speed": c.wheel_speed, "load_share": c.load_share}}
@@ -151,7 +152,7 @@ def curves_json(curves: Mapping[str, SlipCurve]) -> Content:
 
 
 def to_json(fit: Fit) -> Content:
-    """Return the content of fit.json: the fit without its large arrays, with texts for people."""
+    """Return the content of fit.json: the fit without its large arrays, but with its messages."""
     return {
         "schema": SCHEMA_FIT,
         **{name: getattr(fit, name) for name in _PLAIN},
@@ -195,7 +196,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
     choices = tuple(Choice(**c) for c in content["choices"])
     space = Space(_robot_of(content["robot"]), choices)
     if space.names != content["names"]:
-        raise ValueError("it has other parameters than this version declares")
+        raise ValueError("its parameters differ from those that this version declares")
     variances, settings = content["variances"], content["settings"]
     return Fit(
         space=space,
@@ -245,7 +246,7 @@ def _tuples(plain: Content) -> Content:
 
 
 def _robot_json(robot: Robot) -> Content:
-    """Return a robot as plain values: geometry, names of floors, loads, sessions, every number."""
+    """Return a robot as plain values: geometry, floors, loads, sessions and all parameters."""
     return {
         "geometry": {name: getattr(robot.geometry, name) for name in _SHAPE},
         "surfaces": list(robot.surfaces.labels),

@@ -1,4 +1,4 @@
-"""Result of a fit: fitted numbers with intervals and verdicts on their identifiability.
+"""Result of a fit: parameters with intervals and verdicts on their identifiability.
 
 The modules for showing, sampling, deploying and writing a fit are loaded when a method needs them.
 """
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 Evidence = TypeVar("Evidence")
 
 CONFLICT_STDS = 4.0
-"""A message warns if a number is further than this from its prior mean [prior std]."""
+"""A message warns if a parameter is further than this from its prior mean [prior std]."""
 
 
 @dataclass(frozen=True)
@@ -66,22 +66,22 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Fitted numbers with their uncertainty; `print` shows all, and `fit[path]` returns one.
+    """Fitted parameters with their uncertainty; `print` shows all, and `fit[path]` returns one.
 
     Attributes:
-        space: free and fixed numbers with their priors; its template holds the fixed values.
+        space: free and fixed parameters with their priors; its template holds the fixed values.
         choices: user's priors, start values and fixed values.
         z: search vector at the optimum.
         covariance: Laplace covariance of the search vector, with shared effects marginalised.
         laplace: Laplace covariance as if runs shared no effects.
-        shared: fitted shared effects of neighbouring runs, by floor.
-        extrapolation: factors that multiply variances of numbers and shared effects for runs that
-            were not fitted, by floor@load.
-        variance: variance components by name, those of sessions included [unit squared].
+        shared: fitted shared effects of neighbouring runs, keyed by floor.
+        extrapolation: factors, keyed by floor@load, that multiply the variances of parameters and
+            shared effects when runs are predicted that were not fitted.
+        variance: variance components, those of sessions included, keyed by name [unit squared].
         variance_unit: unit of each component's std.
         runs: (name, sha256) of every fitted run, runs over several floors last.
         channels: logged channels.
-        curves: curve of slip over torque, by floor.
+        curves: curve of slip over torque, keyed by floor.
         current_trend: a [A] and b [A s/m] of the line a + b v fitted to measured less predicted
             currents, v the speed of the body.
         validity: ranges that the runs on each floor cover.
@@ -89,18 +89,19 @@ class Fit:
         reason: sentence on how the fit ended.
         rounds: number of rounds.
         history: loss after each round.
-        remaining: largest coordinate of the full Gauss-Newton step at the end [posterior std]. It
-            shows a solver that stopped away from an optimum.
+        remaining: largest coordinate of the full Gauss-Newton step at the end [posterior std]; if
+            it is large, the solver stopped away from an optimum.
         lag: camera lag for which the windows were cut [s].
         seed: seed of the draws from which the bands of the curves are computed.
-        baselines: fitted numbers of simpler slip models, for comparison.
-        mixed: errors of predictions of runs over several floors, by the fit without them and by
-            fits to half of them, and end-point errors of the other runs before and after, by floor.
-        refused: the same for runs over several floors that contradict the others and were not
-            fitted, with the reason.
+        baselines: fitted parameters of simpler slip models, for comparison.
+        mixed: for runs over several floors: their prediction errors in a fit without them and in
+            fits to half of them, and the end-point errors, keyed by floor, of the runs on one floor
+            before and after the runs over several floors were added.
+        refused: the content of `mixed`, with a reason, if the runs over several floors contradict
+            the runs on one floor and were therefore not fitted.
         data: runs on one floor each; None for a fit that was loaded from its files.
-        problem: likelihood of those runs; None for a loaded fit.
-        optimum: end of the search; None for a loaded fit.
+        problem: likelihood of all fitted runs; None for a loaded fit.
+        optimum: result of the optimisation; None for a loaded fit.
     """
 
     space: Space
@@ -142,34 +143,35 @@ class Fit:
         return str(self)
 
     def __getitem__(self, path: str) -> Estimate:
-        """Return the number of a path with its interval and verdict.
+        """Return the parameter of a path with its interval and verdict.
 
         Raises:
-            KeyError: the fit has no such number; the message lists all.
+            KeyError: the fit has no such parameter; the message lists all.
         """
         if path not in self.parameters:
             raise KeyError(f"no parameter '{path}'; there are {', '.join(self.parameters)}")
         return self.parameters[path]
 
     def plot(self, name: str) -> "Figure":
-        """Draw one of the fit's pictures.
+        """Draw one of the fit's figures.
 
         Args:
             name: `load_share`, `slip_by_heading`, `slip_by_torque`, `current_by_traction` or
                 `paths`.
 
         Raises:
-            ValueError: the picture does not exist, or the runs lack the data that it needs.
+            ValueError: there is no such figure, or the runs lack the data that it needs.
         """
         from slipid.plots.fit import picture
 
         return picture(self, required(self.data), name)
 
     def profile(self, path: str, quiet: bool = False) -> Profile:
-        """Return the profile likelihood of one free number, all others refitted at each point.
+        """Return the profile likelihood of one free parameter, all others refitted at each point.
 
         Raises:
-            ValueError: the number does not exist, is fixed or a vector; the message lists choices.
+            ValueError: the parameter does not exist, is fixed or a vector; the message lists valid
+                ones.
         """
         with Reporter(quiet=quiet) as report:
             report.stage(f"profile of {path}")
@@ -205,7 +207,7 @@ class Fit:
             seed: seed of all random numbers.
             draws: number of draws kept from each ensemble.
             most: number of blocks after which sampling ends even without convergence.
-            plan: walkers and steps, in place of `seed` and `most`.
+            plan: settings of the sampler, which replace `seed` and `most`.
             quiet: show no progress.
         """
         from slipid.infer.posterior import blocks, sample
@@ -230,12 +232,13 @@ class Fit:
         return compared(problem, self.choices, data, question, parts, quiet)
 
     def design(self, *parameters: str, runs: int = 12) -> "Design":
-        """Return the next runs to drive, which reduce the intervals of given numbers most.
+        """Return the runs to drive next, which reduce the intervals of given parameters most.
 
-        Without names, they are chosen for predictions and for all numbers with the verdict weak.
+        Without names, the runs are chosen for predictions and for all parameters with the verdict
+        weak.
 
         Raises:
-            DataError: a number does not exist or is fixed.
+            DataError: a parameter does not exist or is fixed.
         """
         from slipid.infer.design import proposal
         from slipid.infer.design.scope import Scope
@@ -279,12 +282,12 @@ class Fit:
 
     @cached_property
     def robot(self) -> Robot:
-        """Robot with every number at its fitted or fixed value."""
+        """Robot with every parameter at its fitted or fixed value."""
         return self.space.tree(jnp.asarray(self.z))
 
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
-        """Every number by path, with interval and verdict."""
+        """Every parameter, keyed by path, with interval and verdict."""
         volts, flat = self.channels.voltage, members(self.flat)
         found = estimates(self.verdict_space, self.choices, self.z, self.covariance, volts, flat)
         return marked({e.path: e for e in found}, self.disputes)
@@ -293,7 +296,7 @@ class Fit:
     def verdict_space(self) -> Space:
         """Search space with the fitted prior std of load biases.
 
-        Verdicts compare posterior stds with its prior stds.
+        Verdicts compare posterior stds with the prior stds of this space.
         """
         if POOLED not in self.variance:
             return self.space
@@ -301,7 +304,7 @@ class Fit:
 
     @cached_property
     def disputes(self) -> dict[tuple[str, str], float]:
-        """Pairs of floors whose estimated wheel loads disagree, and their differences [std]."""
+        """Pairs of floors whose estimated wheel loads disagree, and by how many standard errors."""
         return disputes(self.verdict_space, self.z, self.covariance)
 
     @cached_property
@@ -317,13 +320,13 @@ class Fit:
 
     @cached_property
     def derived(self) -> dict[str, Estimate]:
-        """Ratios of numbers by path, which may be identified where the numbers are not."""
+        """Ratios of parameters, keyed by path; a ratio may be identified if its parts are not."""
         found = derived(self.space, self.z, self.covariance, self.channels.voltage)
         return {e.path: e for e in found}
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Warnings about the numbers, one sentence each."""
+        """Warnings about the fit and its parameters, one sentence each."""
         found = [*sentences(self.flat)]
         found += [
             f"the wheel loads estimated on {one} and on {other} differ by {sigma:.1f} standard "
@@ -356,7 +359,7 @@ class Fit:
 
 
 def required(evidence: Evidence | None) -> Evidence:
-    """Return the argument; raise `ValueError` if it is None, as in a fit loaded from files."""
+    """Return an attribute of a fit; raise `ValueError` if it is None, as after `Fit.load`."""
     if evidence is None:
         raise ValueError(
             "this fit was loaded from its files, which contain neither the runs nor their "

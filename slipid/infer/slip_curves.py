@@ -20,12 +20,12 @@ from slipid.search_space import Space
 CURVE_POINTS = 41
 """Number of points of a curve."""
 _STEADY = 0.1
-"""Largest deviation of a steady command from the run's median command, relative to the latter."""
+"""Largest deviation of a steady command from the run's median command, relative to the median."""
 _MOVED = 0.1
-"""A window counts as moving if its speed exceeds this ratio of the speed of the fastest window."""
+"""A window counts as moving above this fraction of the speed of the fastest window."""
 _SECTOR, _COMMON = 30.0, 0.02
-"""Width of a sector of headings [deg], and least fraction of the windows in a sector for its
-heading to count as driven."""
+"""Width of a sector of headings [deg], and smallest fraction of all windows that a sector must
+contain for its heading to count as driven."""
 _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
 
 
@@ -39,7 +39,7 @@ class SlipCurve:
         slip_lo: lower end of the 90 % band.
         slip_hi: upper end of the 90 % band.
         wheel_speed: wheel speed for which the curve is computed [rad/s].
-        load_share: share of the weight on the wheel for which the curve is computed.
+        load_share: fraction of the weight on the wheel for which the curve is computed.
     """
 
     torque_nm: Float[np.ndarray, " torque"]
@@ -69,20 +69,20 @@ def wheel_states(robot: Robot, b: lk.Batch) -> tuple[np.ndarray, np.ndarray, np.
 def torque_of_slip(
     robot: Robot, wheel_speed: Float[Array, " surface"], share: float
 ) -> Float[Array, "surface slip"]:
-    """Return the torque [N m] of a wheel that slips by `_SLIP` along its drive direction.
+    """Return the torque [N m] of a wheel that slips by `_SLIP` in its rolling direction.
 
-    Source: `slipid.model.contact_law` without sideways rolling.
+    The contact law is that of `slipid.model.contact_law` without sideways rolling.
 
     Args:
         robot: fitted robot.
         wheel_speed: speed of the wheel on each floor [rad/s].
-        share: share of the weight on the wheel.
+        share: fraction of the weight on the wheel.
     """
     radius, weight = robot.geometry.wheel_radius, robot.body.mass * GRAVITY
 
     def one(floor: ContactSurface, speed: Array) -> Array:
         rim = radius * speed
-        traction = law.wheel_traction(jnp.asarray(_SLIP) * rim, rim, floor).force()
+        traction = law.wheel_traction(jnp.asarray(_SLIP) * rim, rim, floor).force
         return radius * weight * law.load_force(jnp.asarray(share), floor) * traction
 
     return jax.vmap(one)(robot.surfaces, wheel_speed)
@@ -91,10 +91,10 @@ def torque_of_slip(
 def curves(
     space: Space, z: np.ndarray, draws: Float[np.ndarray, "draw free"], b: lk.Batch
 ) -> dict[str, SlipCurve]:
-    """Return slip over torque by floor with a 90 % band, up to the measured torques.
+    """Return slip over torque, keyed by floor, with a 90 % band, up to the measured torques.
 
-    Curves are computed at the median speed of the wheels that turned, for equal loads on all
-    wheels.
+    Curves are computed at the median speed of the wheels that turned, with equal normal forces on
+    all wheels.
     """
     robot = space.tree(jnp.asarray(z))
     speed, torque = (np.abs(x) for x in wheel_states(robot, b)[:2])
@@ -173,10 +173,9 @@ def by_encoders(
 ) -> tuple[
     Float[np.ndarray, " heading"], Float[np.ndarray, " speed"], Float[np.ndarray, " yaw_rate"]
 ]:
-    """Return approximate driven motions from encoder twists.
+    """Return frequent headings [deg], and quantiles of speeds [m/s] and of yaw rates [rad/s].
 
-    They are the frequent headings [deg], and the 10, 50 and 90 % quantiles of speeds [m/s] and yaw
-    rates [rad/s].
+    All are computed from encoder twists; the quantiles are 10, 50 and 90 %.
     """
     speed = np.linalg.norm(twist[:, :2], axis=1)
     ahead = speed > _MOVED * speed.max(initial=0.0)
@@ -185,7 +184,8 @@ def by_encoders(
     angle = np.degrees(np.arctan2(twist[ahead, 1], twist[ahead, 0]))
     headings, count = np.unique((np.round(angle / _SECTOR) * _SECTOR) % 360.0, return_counts=True)
     common = headings[count >= _COMMON * count.sum()]
-    signed = np.where(common > 180.0, common - 360.0, common)  # rounded like commands
+    # The headings of commands are in (-180, 180] deg.
+    signed = np.where(common > 180.0, common - 360.0, common)
     parts = (0.1, 0.5, 0.9)
     speeds = np.quantile(speed[ahead], parts) if ahead.any() else np.zeros(0)
     rates = np.quantile(twist[on, 2], parts) if on.any() else np.zeros(0)

@@ -80,13 +80,13 @@ def summarise(
 def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
     """Return the largest coordinate of a full Gauss-Newton step [posterior std], and its name.
 
-    The stds are those of the Laplace covariance, as in the stopping rule of the rounds. Those from
-    the solver's own rows would be too small for friction, since the solver holds the contact forces
-    fixed.
+    The stds are those of the Laplace covariance, as in the stopping rule of the rounds. Stds from
+    the solver's own Jacobian would be too small for friction, since the solver holds the contact
+    forces fixed.
 
-    The step is delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), with W the weighted
-    inverse noise covariance, S the prior stds, and g the gradient of log |d residuals / d data|.
-    Currents and voltages change the electric numbers only.
+    The step is delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), with r the residuals,
+    J their Jacobian, W the weighted inverse noise covariance, S the prior stds, and g the gradient
+    of log |d residuals / d data|. Currents and voltages change the electric parameters only.
     """
     state, every = optimum.state, problem.full_weight
     z, log_v = state.z, state.log_variance

@@ -42,7 +42,7 @@ class Camera(eqx.Module):
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 
     def corrected(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return a logged pose in true metres, with the heading rotated as the map rotates there.
+        """Return a logged pose in true metres, its heading rotated as the map rotates directions.
 
         The heading is still that of the marker: the marker yaw is not subtracted.
         """
@@ -84,7 +84,7 @@ class Camera(eqx.Module):
     def yaw(self, session: Int[Array, ""] | int) -> Float[Array, ""]:
         """Return the marker's heading less the body's [rad] in a session.
 
-        Session -1, which was not fitted, has the heading without a session's deviation.
+        In session -1, which stands for any session that was not fitted, the deviation is zero.
         """
         if not self.sessions:
             return self.marker_yaw

@@ -5,7 +5,6 @@ number of chord steps, which approach it from any start, followed by damped Newt
 analytic 3x3 Jacobian; its derivative follows from the implicit function theorem.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -19,17 +18,17 @@ from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, solve3
 
 _CHORD_STEPS = 30
-"""Number of chord steps of `_solve`."""
+"""Number of chord steps of `root`."""
 _NEWTON_STEPS = 8
-"""Number of damped Newton steps of `_solve`, after the chord steps."""
+"""Number of damped Newton steps of `root`, after the chord steps."""
 _DAMPING = (1.0, 0.3, 0.05)
 """Factors of Newton's step that are tried in each damped step."""
 _ROUNDING = 1e-20
 """Squared residual force [(mu m g)^2] below which no better step exists because of rounding."""
 _CONVERGED_STEP = 1e-6
-"""Largest component of the last step with which `_solve_near` has converged [m/s], [rad/s]."""
+"""Largest component of the last step with which `root_near` has converged [m/s], [rad/s]."""
 _MOST_NEAR_STEPS = 12
-"""Largest number of Newton steps of `_solve_near`."""
+"""Largest number of Newton steps of `root_near`."""
 SETTLE_CHORD_STEPS, SETTLE_NEWTON_STEPS = 4, 2
 """Numbers of chord and of Newton steps that `settle` takes from the previous time step's twist.
 
@@ -43,15 +42,16 @@ class ContactProblem(eqx.Module):
     """Inputs that determine the twist of a robot.
 
     Attributes:
-        rim, frame, surface, rest: as in `equilibrium`.
-        start: twist from which the search starts.
+        rim: r w, rim speed of each wheel [m/s].
+        frame: wheel directions.
+        surface: one floor, or one under each wheel.
+        rest: load shares at rest, sum 1.
     """
 
     rim: Float[Array, " wheel"]
     frame: WheelFrame
     surface: ContactSurface
     rest: Float[Array, " wheel"]
-    start: Float[Array, "3"]
 
     def balance(self) -> Balance:
         """Return the forces as a function of the twist."""
@@ -60,7 +60,8 @@ class ContactProblem(eqx.Module):
 
 def _damped(balance: Balance, xi: Planar) -> Planar:
     """Return the best of several damped Newton steps, or a chord step if none of them improves."""
-    step, before = balance.newton(xi), balance.size(balance.force(xi))
+    here = balance.at(xi)
+    step, before = here.newton, balance.size(here.force)
 
     def less(alpha: Array) -> Planar:
         return jax.tree.map(lambda x, d: x - alpha * d, xi, step)
@@ -74,27 +75,35 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
     best = jnp.argmin(tried)
     # where all wheels slide, forces depend little on the twist and Newton's step leads far away
     stuck = (tried[best] >= before) & (before > _ROUNDING)
-    return jax.tree.map(partial(jnp.where, stuck), balance.chord(xi), less(damping[best]))
+    return jax.tree.map(partial(jnp.where, stuck), here.chord(), less(damping[best]))
 
 
-@jax.custom_jvp
 @jax.jit
-def _solve(problem: ContactProblem) -> Float[Array, "3"]:
+def root(problem: ContactProblem) -> Float[Array, "3"]:
+    """Return the twist at which the forces balance, found from the twist without slip.
+
+    Its derivative is that of `differentiable`, not that of this function.
+    """
     balance = problem.balance()
 
     def chord(xi: Array, _: None) -> tuple[Array, None]:
-        return jnp.stack(balance.chord(Planar(*xi))), None
+        return jnp.stack(balance.at(Planar(*xi)).chord()), None
 
     def newton(xi: Array, _: None) -> tuple[Array, None]:
         return jnp.stack(_damped(balance, Planar(*xi))), None
 
-    near = jax.lax.scan(chord, problem.start, None, length=_CHORD_STEPS)[0]
+    start = _start(problem.rim, problem.frame)
+    near = jax.lax.scan(chord, start, None, length=_CHORD_STEPS)[0]
     return jax.lax.scan(newton, near, None, length=_NEWTON_STEPS)[0]
 
 
-@jax.custom_jvp
 @jax.jit
-def _solve_near(problem: ContactProblem) -> Float[Array, "3"]:
+def root_near(problem: ContactProblem, start: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Return the root found by plain Newton steps from a twist close to it, about ten times sooner.
+
+    The result is NaN if they do not converge. The last step is below 1e-6 m/s or rad/s, so that the
+    remaining error is of the order of its square.
+    """
     balance = problem.balance()
 
     def far(state: tuple[Array, Array, Array]) -> Array:
@@ -103,40 +112,40 @@ def _solve_near(problem: ContactProblem) -> Float[Array, "3"]:
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         xi, _, count = state
-        step = jnp.stack(balance.newton(Planar(*xi)))
+        step = jnp.stack(balance.at(Planar(*xi)).newton)
         return xi - step, step, count + 1
 
-    first = (problem.start, jnp.full(3, jnp.inf), jnp.zeros((), int))
+    first = (start, jnp.full(3, jnp.inf), jnp.zeros((), int))
     xi, step, _ = jax.lax.while_loop(far, newton, first)
     return jnp.where(jnp.max(jnp.abs(step)) > _CONVERGED_STEP, jnp.nan, xi)
 
 
-OneProblem = tuple[ContactProblem]
+@jax.custom_jvp
+def differentiable(problem: ContactProblem, xi: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Return the root `xi` of a problem, with the derivative that it has as a function of it.
+
+    The derivative follows from the implicit function theorem, however the root was found.
+    """
+    return xi
 
 
+@differentiable.defjvp
 def _implicit_derivative(
-    root: Callable[[ContactProblem], Array],
-) -> Callable[[OneProblem, OneProblem], tuple[Array, Array]]:
-    """Return the JAX derivative rule of a root finder, by the implicit function theorem."""
-
-    def rule(primals: OneProblem, tangents: OneProblem) -> tuple[Array, Array]:
-        xi = root(*primals)
-        return xi, moved(xi, primals, tangents)
-
-    @jax.jit
-    def moved(xi: Array, primals: OneProblem, tangents: OneProblem) -> Array:
-        at = Planar(*xi)
-        _, force = jax.jvp(lambda problem: problem.balance().force(at), primals, tangents)
-        return -jnp.stack(solve3(primals[0].balance().jacobian(at), force))
-
-    return rule
+    primals: tuple[ContactProblem, Array], tangents: tuple[ContactProblem, Array]
+) -> tuple[Array, Array]:
+    (problem, _), (change, _) = primals, tangents
+    xi = differentiable(*primals)
+    return xi, _moved(xi, problem, change)
 
 
-_solve.defjvp(_implicit_derivative(_solve))
-_solve_near.defjvp(_implicit_derivative(_solve_near))
+@jax.jit
+def _moved(xi: Array, problem: ContactProblem, change: ContactProblem) -> Array:
+    at = Planar(*xi)
+    _, force = jax.jvp(lambda p: p.balance().force(at), (problem,), (change,))
+    return -jnp.stack(solve3(problem.balance().at(at).jacobian(), force))
 
 
-def initial_twist(rim: Float[Array, " wheel"], frame: WheelFrame) -> Float[Array, "3"]:
+def _start(rim: Float[Array, " wheel"], frame: WheelFrame) -> Float[Array, "3"]:
     """Return the start of the root finder: 0.8 times the twist without slip (least squares)."""
     j = frame.hold
     m = Columns(*(Planar(*column) for column in j.T @ j + 1e-6 * jnp.eye(3)))
@@ -148,24 +157,15 @@ def equilibrium(
     frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
-    near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
     """Return the body twist (vx [m/s], vy [m/s], yaw rate [rad/s]) at which contact forces balance.
 
-    Args:
-        rim: r w, rim speed of each wheel [m/s].
-        frame: wheel directions.
-        surface: one floor, or one under each wheel.
-        rest: load shares at rest, sum 1.
-        near: a twist so close to the root that plain Newton steps converge, which is about ten
-            times cheaper; the result is NaN if they do not converge. The last step is below 1e-6
-            m/s or rad/s, so that the remaining error is of the order of its square.
+    The arguments are those of `ContactProblem`.
 
     Source: the balance at the head of `slipid.model.contact_law`.
     """
-    start = jax.lax.stop_gradient(initial_twist(rim, frame) if near is None else near)
-    problem = ContactProblem(rim, frame, surface, rest, start)
-    return _solve(problem) if near is None else _solve_near(problem)
+    problem = ContactProblem(rim, frame, surface, rest)
+    return differentiable(problem, root(jax.lax.stop_gradient(problem)))
 
 
 def settle(
@@ -191,7 +191,7 @@ def settle(
     balance = Balance(rim, on)
 
     def chord(xi: Planar, _: None) -> tuple[Planar, None]:
-        return balance.chord(xi), None
+        return balance.at(xi).chord(), None
 
     # unrolled for XLA; a loop in the generated C code
     near, _ = jax.lax.scan(
@@ -199,12 +199,13 @@ def settle(
     )
     xi = near
     for _ in range(SETTLE_NEWTON_STEPS):
-        xi = jax.tree.map(jnp.subtract, xi, balance.newton(xi))
+        xi = jax.tree.map(jnp.subtract, xi, balance.at(xi).newton)
     # a comparison with NaN is false, so that NaN is never nearer
-    nearer = balance.size(balance.force(xi)) <= balance.size(balance.force(near))
+    last, first = balance.at(xi), balance.at(near)
+    nearer = balance.size(last.force) <= balance.size(first.force)
     found = jax.tree.map(lambda x, n: jnp.where(nearer, x, n), xi, near)
     sound = jnp.isfinite(found.x + found.y + found.yaw)
     free = Planar(*(total(row[:, None] * rim) for row in plain))
     twist = jnp.stack(jax.tree.map(lambda x, p: jnp.where(sound, x, p), found, free))
-    motor_force = jnp.where(nearer, balance.motor_force(xi), balance.motor_force(near))
+    motor_force = jnp.where(nearer, last.motor_force, first.motor_force)
     return twist, jnp.where(jnp.isfinite(motor_force), motor_force, 0.0)

@@ -5,7 +5,8 @@ over x, y, yaw are written out instead of matrix products, so that XLA compiles 
 over contiguous numbers: each loop costs at least 0.2 us.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import equinox as eqx
 import jax
@@ -89,54 +90,106 @@ class Balance(eqx.Module):
     rim: Float[Array, "wheel *batch"]
     on: Stance
 
+    def at(self, xi: Planar) -> "BalanceAt":
+        """Return the forces at a twist."""
+        return BalanceAt(self.rim, self.on, xi)
+
     def force(self, xi: Planar) -> Planar:
         """Return the resultant force on the body, zero at equilibrium."""
-        w, load = self.wheels(*self._speeds(xi)), self.load(xi)
-        x, y, yaw = self._summed(load * w.push(), -load * w.drag.force())
-        return Planar(x, y, yaw - law.scrub_moment(xi.yaw, self.on.floor.scrub).force())
+        return self.at(xi).force
 
-    def jacobian(self, xi: Planar) -> Columns:
+    def size(self, force: Planar) -> Float[Array, "*batch"]:
+        """Return the squared size of a force, with its moment divided by the base radius."""
+        return force.x**2 + force.y**2 + (force.yaw / self.on.frame.base) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class BalanceAt:
+    """Forces of a `Balance` at one twist; what several of them need is traced once.
+
+    Attributes:
+        rim, on: as in `Balance`.
+        xi: the twist.
+    """
+
+    rim: Float[Array, "wheel *batch"]
+    on: Stance
+    xi: Planar
+
+    @cached_property
+    def speeds(self) -> tuple[Array, Array]:
+        """Speeds of the wheels along their drive and along their rollers [m/s]."""
+        on = self.on
+        return dot(on.hold, self.xi), dot(on.roll, self.xi) - self.rim * on.frame.roller_share
+
+    @cached_property
+    def wheels(self) -> WheelForces:
+        """Forces of the contact law at these speeds."""
+        f = self.on.frame
+        grip = f.grip if f.ordinary else None
+        where = *self.speeds, self.rim, f.drive_share, self.on.drag_onset
+        return law.wheel_forces(*where, self.on.floor, grip)
+
+    @cached_property
+    def share(self) -> Float[Array, "wheel *batch"]:
+        """Load shares in motion."""
+        return law.load_shift(self.xi, self.on.rest, self.on.shift, self.on.floor.lead)
+
+    @cached_property
+    def load(self) -> Float[Array, "wheel *batch"]:
+        """Friction coefficient times load of every wheel, divided by mean(mu) m g."""
+        return law.load_force(self.share, self.on.floor)
+
+    @cached_property
+    def force(self) -> Planar:
+        """Resultant force on the body, zero at equilibrium."""
+        w = self.wheels
+        x, y, yaw = self._summed(self.load * w.push, -self.load * w.drag.force)
+        return Planar(x, y, yaw - law.scrub_moment(self.xi.yaw, self.on.floor.scrub).force)
+
+    def jacobian(self) -> Columns:
         """Return the derivative of the force by the twist, through speeds and through loads."""
-        (along, roll), load, rows = self._speeds(xi), self.load(xi), self.on
-        w = self.wheels(along, roll)
-        push, drag = w.push(), -w.drag.force()
-        by_roll = roll / w.active  # derivative of the activity by the roller speed
+        w, load, on = self.wheels, self.load, self.on
+        by_roll = self.speeds[1] / w.active  # derivative of the activity by the roller speed
         by_along = -w.traction.by_speed() - w.resistance.by_speed()
         across = (w.traction.by_activity() - w.resistance.by_activity()) * by_roll
         rolls = -w.drag.by_speed() - w.drag.by_activity() * by_roll
         turned: Array | float = 0.0  # derivative of the drag along rollers by the speed along drive
-        if rows.frame.ordinary:
-            across = across + rows.frame.grip * w.traction.by_beside()
-            turned = load * rows.frame.grip * w.drag.by_beside()
+        if on.frame.ordinary:
+            across = across + on.frame.grip * w.traction.by_beside()
+            turned = load * on.frame.grip * w.drag.by_beside()
         by_along, across, rolls = load * by_along, load * across, load * rolls
-        one = jnp.ones_like(xi.x)
-        by_x = jax.jvp(lambda v: self.load(xi._replace(x=v)), (xi.x,), (one,))[1]
-        by_y = jax.jvp(lambda v: self.load(xi._replace(y=v)), (xi.y,), (one,))[1]
 
         def column(k: int, pushed: Array | float, dragged: Array | float) -> Planar:
-            along = by_along * rows.hold[k] + across * rows.roll[k] + pushed
-            back = rolls * rows.roll[k] + turned * rows.hold[k] + dragged
+            along = by_along * on.hold[k] + across * on.roll[k] + pushed
+            back = rolls * on.roll[k] + turned * on.hold[k] + dragged
             return self._summed(along, back)
 
-        scrub = law.scrub_moment(xi.yaw, self.on.floor.scrub).by_speed()
-        x, y = column(0, push * by_x, drag * by_x), column(1, push * by_y, drag * by_y)
+        by_x, by_y = (
+            law.load_force(slope, on.floor)
+            for slope in law.load_shift_slope(self.xi, on.shift, on.floor.lead)
+        )
+        x = column(0, w.push * by_x, -w.drag.force * by_x)
+        y = column(1, w.push * by_y, -w.drag.force * by_y)
         yaw = column(2, 0.0, 0.0)
+        scrub = law.scrub_moment(self.xi.yaw, on.floor.scrub).by_speed()
         return Columns(x, y, yaw._replace(yaw=yaw.yaw - scrub))
 
-    def newton(self, xi: Planar) -> Planar:
-        """Return Newton's step, which is to be subtracted from the twist."""
-        return solve3(self.jacobian(xi), self.force(xi))
+    @cached_property
+    def newton(self) -> Planar:
+        """Newton's step, which is to be subtracted from the twist."""
+        return solve3(self.jacobian(), self.force)
 
-    def chord(self, xi: Planar) -> Planar:
+    def chord(self) -> Planar:
         """Return the twist that balances the forces when each is replaced by its chord.
 
         A chord is the line through zero at zero speed and through the force at xi (Weiszfeld's
         iteration). Since tanh(x) / x falls with |x|, chord steps do not overshoot as Newton's do;
         near the root they converge slowly.
         """
-        on, f, w = self.on, self.on.frame, self.wheels(*self._speeds(xi))
+        on, f, w = self.on, self.on.frame, self.wheels
         # A lifted wheel has a negative load share, which would give its chords the wrong sign.
-        load = law.load_force(jnp.maximum(self.share(xi), _LEAST_LOAD), on.floor)
+        load = law.load_force(jnp.maximum(self.share, _LEAST_LOAD), on.floor)
         pulls, rolls = load * w.traction.chord(), load * w.drag.chord()
         both = pulls + load * w.resistance.chord()
 
@@ -146,51 +199,26 @@ class Balance(eqx.Module):
 
         xx, xy, yy = entry(0, 0), entry(0, 1), entry(1, 1)
         x_yaw, y_yaw, turn = entry(0, 2), entry(1, 2), entry(2, 2)
-        turn += law.scrub_moment(xi.yaw, on.floor.scrub).chord()
+        turn += law.scrub_moment(self.xi.yaw, on.floor.scrub).chord()
         m = Columns(Planar(xx, xy, x_yaw), Planar(xy, yy, y_yaw), Planar(x_yaw, y_yaw, turn))
         drive = self._summed(pulls * self.rim * f.drive_share, rolls * self.rim * f.roller_share)
         return solve3(m, drive)
 
-    def motor_force(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Return the traction against which each motor works [mean(mu) m g]."""
+    @property
+    def motor_force(self) -> Float[Array, "wheel *batch"]:
+        """Traction against which each motor works [mean(mu) m g]."""
         f = self.on.frame
-        return self.load(xi) * self.wheels(*self._speeds(xi)).motor_force(
-            f.drive_share, f.roller_share
-        )
+        return self.load * self.wheels.motor_force(f.drive_share, f.roller_share)
 
-    def rolling_drag(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Return the rolling drag of each wheel along its drive, for `Motor.rolling_drag` 1.
+    @property
+    def rolling_drag(self) -> Float[Array, "wheel *batch"]:
+        """Rolling drag of each wheel along its drive, for `Motor.rolling_drag` 1.
 
         Only the motors work against it; it exerts no force on the body.
         """
-        _, roll = self._speeds(xi)
         return self.on.roller_scale * law.rolling_fraction(
-            self.rim, roll, self.on.frame.drive_share
+            self.rim, self.speeds[1], self.on.frame.drive_share
         )
-
-    def size(self, force: Planar) -> Float[Array, "*batch"]:
-        """Return the squared size of a force, with its moment divided by the base radius."""
-        return force.x**2 + force.y**2 + (force.yaw / self.on.frame.base) ** 2
-
-    def share(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Return the load shares in motion."""
-        return law.load_shift(xi, self.on.rest, self.on.shift, self.on.floor.lead)
-
-    def load(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Return friction coefficient times load of every wheel, divided by mean(mu) m g."""
-        return law.load_force(self.share(xi), self.on.floor)
-
-    def wheels(self, along: Array, roll: Array) -> WheelForces:
-        """Return the forces of the contact law at the speeds of the wheels."""
-        f = self.on.frame
-        grip = f.grip if f.ordinary else None
-        where = along, roll, self.rim, f.drive_share, self.on.drag_onset
-        return law.wheel_forces(*where, self.on.floor, grip)
-
-    def _speeds(self, xi: Planar) -> tuple[Array, Array]:
-        """Return the speeds of the wheels along their drive and along their rollers."""
-        on = self.on
-        return dot(on.hold, xi), dot(on.roll, xi) - self.rim * on.frame.roller_share
 
     def _summed(self, along: Array, roll: Array) -> Planar:
         """Return the force on the body from forces along the drives and along the rollers."""

@@ -36,7 +36,7 @@ Every function here is elementwise: it takes arrays of any shapes that broadcast
 """
 
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import equinox as eqx
 import jax
@@ -146,8 +146,9 @@ class Friction(eqx.Module):
     viscosity: Array | float = 0.0
     beside: Array | None = None
 
+    @cached_property
     def force(self) -> Array:
-        """Return the force."""
+        """The force."""
         if self.beside is None:
             return self.top * jnp.tanh(self.speed / self.onset) + self.viscosity * self.speed
         return (self.top * self._slope() + self.viscosity) * self.speed
@@ -211,9 +212,10 @@ class WheelForces(eqx.Module):
     resistance: Friction
     drag: Friction
 
+    @cached_property
     def push(self) -> Array:
-        """Return the force on the body along the drive."""
-        return self.traction.force() - self.resistance.force()
+        """Force on the body along the drive."""
+        return self.traction.force - self.resistance.force
 
     def motor_force(self, drive_share: Array, roller_share: Array) -> Array:
         """Return the force that the motor works against; arguments are those of `WheelFrame`.
@@ -222,7 +224,7 @@ class WheelForces(eqx.Module):
         motor's own friction. Rollers at an angle (mecanum) transmit a part of the traction and a
         part of their drag to the motor.
         """
-        return self.traction.force() * drive_share - self.drag.force() * roller_share
+        return self.traction.force * drive_share - self.drag.force * roller_share
 
 
 def wheel_traction(
@@ -321,3 +323,14 @@ def load_shift(xi: Planar, rest: Array, shift: Float[Array, "2 wheel *one"], lea
     """Return load shares in motion, where contacts lead the wheel centres by `lead` [m]."""
     inv = jax.lax.rsqrt(xi.x**2 + xi.y**2 + 1e-8)
     return rest - lead * (shift[0] * (xi.x * inv) + shift[1] * (xi.y * inv))
+
+
+def load_shift_slope(
+    xi: Planar, shift: Float[Array, "2 wheel *one"], lead: Array
+) -> tuple[Array, Array]:
+    """Return the derivatives of `load_shift` by the two velocities [s/m]."""
+    inv = jax.lax.rsqrt(xi.x**2 + xi.y**2 + 1e-8)
+    ahead, left = xi.x * inv, xi.y * inv
+    per_speed, mixed = -lead * inv, ahead * left
+    by_x = per_speed * (shift[0] * (1 - ahead**2) - shift[1] * mixed)
+    return by_x, per_speed * (shift[1] * (1 - left**2) - shift[0] * mixed)

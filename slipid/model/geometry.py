@@ -17,9 +17,10 @@ from jaxtyping import Array, Float
 from slipid.parameter import as_numbers, known
 
 _MIRRORED = 0.01
-"""Largest difference of a wheel from a mirror image, for `Geometry.mirror`.
+"""Largest difference between a wheel and the mirror image of a wheel in `Geometry.mirror`.
 
-It limits distances, in base radii, and twice the angle between lines [rad].
+It limits the distance of their positions, in base radii, and twice the angle between their lines
+[rad].
 """
 
 
@@ -44,17 +45,17 @@ class Drives(eqx.Module):
         return len(set(self.drive_of)) or self.wheels
 
     def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return the values of drives at their wheels, such as the speed of every wheel."""
+        """Return for each wheel the value of its drive, such as the wheel speed."""
         return of_drives[..., jnp.asarray(self.drive_of)] if self.drive_of else of_drives
 
     def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """Return the sums of wheels' values by drive, such as the torque of every drive."""
+        """Return for each drive the sum over its wheels, such as the torque."""
         if not self.drive_of:
             return of_wheels
         return of_wheels @ jnp.asarray(np.eye(self.drives)[list(self.drive_of)])
 
     def on_average(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """Return the means of wheels' values by drive."""
+        """Return for each drive the mean over its wheels."""
         if not self.drive_of:
             return of_wheels
         return self.at_drives(of_wheels) / self.at_drives(jnp.ones(self.wheels))
@@ -165,13 +166,14 @@ class Geometry(Drives):
         return None
 
     def forward(self) -> Float[Array, "drive 3"]:
-        """Return `WheelFrame.forward` for the current radii and drive offsets."""
+        """Return the matrix from body twist to rim speeds (`WheelFrame.forward`), as calibrated."""
         return self.frame().forward()
 
     def pseudo_inverse(self) -> Float[Array, "3 drive"]:
-        """Return J^+, which gives the least-squares body twist from the drives' rim speeds [m/s].
+        """Return the matrix from the drives' rim speeds [m/s] to the least-squares body twist.
 
-        Wheels that all point ahead do not determine motion sideways; J^+ gives zero for it.
+        This is the pseudo-inverse of `forward`. If all wheels point ahead, they do not determine
+        the sideways speed, for which the matrix gives zero.
         """
         return jax.device_put(np.linalg.pinv(np.asarray(self.forward()), rcond=1e-6))
 
@@ -185,7 +187,7 @@ class WheelFrame(Drives):
             drive direction.
         roll: rows that give the speed along the free rolling direction (wheel, 3).
         drive_share: component of the rim speed r w along `hold`: sin(roller angle), times the
-            wheel's radius over r. Wheel activity is computed with r itself.
+            wheel's radius over r. The wheel activity of `contact_law` is computed with r itself.
         roller_share: component of the rim speed along `roll`: cos(roller angle), times the same
             ratio of radii.
         grip: 1 for a wheel without rollers, else 0.
@@ -213,7 +215,7 @@ class WheelFrame(Drives):
 
     @eqx.filter_jit
     def forward(self) -> Float[Array, "drive 3"]:
-        """Return J, which gives the rim speed r w of each drive [m/s] from a twist without slip.
+        """Return the matrix from a body twist without slip to the rim speed of each drive [m/s].
 
         The row of a drive with several wheels is the mean over its wheels.
         """

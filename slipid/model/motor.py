@@ -71,10 +71,10 @@ class Motor(eqx.Module):
         )
 
     def opposing_force(self, motor_force: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
-        """Return the force that a motor works against: traction plus drag along the drive.
+        """Return the force that a motor works against: traction, plus drag in the drive direction.
 
-        `motor_force` holds the two, as `slipid.model.robot.Standing.motor_forces` returns them, and
-        the result has the same unit.
+        `motor_force` has the traction and, before it is multiplied by `rolling_drag`, the drag, as
+        `slipid.model.robot.Standing.motor_forces` returns them. The result has the same unit.
         """
         return motor_force[..., 0] + self.rolling_drag * motor_force[..., 1]
 
@@ -98,9 +98,12 @@ class Motor(eqx.Module):
     def characteristic(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
-        """Return M = U I / wm = C_e I + R I^2 wm / (wm^2 + w0^2) [N m], finite at standstill.
+        """Return the "torque characterising variable" M of the 2021 paper [N m].
 
-        Source: the paper's "torque characterising variable" (Belyaev, Brylev, Ivanov 2021).
+        M = U I / wm with the voltage U, current I and motor speed wm. It is computed as
+        C_e I + R I^2 wm / (wm^2 + w0^2), which is finite at standstill, with w0 = `REST`.
+
+        Source: Belyaev, Brylev, Ivanov 2021.
         """
         wm = self.gear_ratio * wheel_speed
         return self.back_emf * current + self.resistance * current**2 * wm / (wm**2 + REST**2)
@@ -109,9 +112,10 @@ class Motor(eqx.Module):
 def signed(
     current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"], gear_ratio: Array | float
 ) -> Float[Array, " *w"]:
-    """Return signed currents of an unsigned log: I = |I| wm / sqrt(wm^2 + w0^2).
+    """Return currents logged as magnitudes with the sign of the motor speed.
 
-    The sign of a braking current is lost.
+    I = |I| wm / sqrt(wm^2 + w0^2) with the motor speed wm and w0 = `REST`, so that the sign changes
+    smoothly. A current that brakes gets the wrong sign.
     """
     wm = gear_ratio * wheel_speed
     return jnp.abs(current) * wm / jnp.sqrt(wm**2 + REST**2)

@@ -67,7 +67,7 @@ class Robot(eqx.Module):
         gear_ratio: Number = 1.0,
         mass: Number = 10.0,
     ) -> "Robot":
-        """Return a robot with omni wheels on a circle, each driving 90 deg ahead of its azimuth.
+        """Return a robot with omni wheels on a circle, driving at their azimuth plus 90 deg.
 
         Args:
             azimuth_deg: azimuths of the wheels, counter-clockwise from ahead [deg].
@@ -93,7 +93,7 @@ class Robot(eqx.Module):
         sessions: Sequence[str] = (),
         image_centre: tuple[float, float] = (0.0, 0.0),
     ) -> "Robot":
-        """Return the same robot for these floors, load set-ups and sessions, at start values.
+        """Return the robot with new floors, load set-ups and sessions, all at start values.
 
         `image_centre` is the point at which the camera's tilt and distortion are zero [m].
         """
@@ -103,26 +103,27 @@ class Robot(eqx.Module):
     def standing(self, frame: WheelFrame, surface: Array, load: Array) -> "Standing":
         """Return the robot on a floor, or on one floor per wheel, with a load set-up.
 
-        `frame` are its wheels, `surface` and `load` indices of floors and of the load set-up.
+        `frame` holds the robot's wheels; `surface` and `load` are indices of the floors and of the
+        load set-up.
         """
         rest = self.body.load_share[load]
         return Standing(frame, self.surfaces.at(surface), rest, self.motor, self.body.mass)
 
     def surface_index(self, name: str) -> int:
-        """Return the position of a floor in the stack; ValueError with the choices if unknown."""
+        """Return the index of a floor in `surfaces`; raise `ValueError` if it is unknown."""
         if name not in self.surfaces.labels:
             known = ", ".join(self.surfaces.labels)
             raise ValueError(f"no surface '{name}'; identified: {known}")
         return self.surfaces.labels.index(name)
 
     def load_index(self, name: str) -> int:
-        """Return the position of a load set-up; ValueError with the choices if unknown."""
+        """Return the index of a load set-up; raise `ValueError` if it is unknown."""
         if name not in self.body.loads:
             raise ValueError(f"no load set-up '{name}'; identified: {', '.join(self.body.loads)}")
         return self.body.loads.index(name)
 
     def session_index(self, name: str) -> int:
-        """Return the position of a session, -1 for one that was not fitted."""
+        """Return the index of a session; -1 for a session that was not fitted."""
         return self.camera.sessions.index(name) if name in self.camera.sessions else -1
 
 
@@ -143,28 +144,28 @@ class Standing(eqx.Module):
     motor: Motor
     mass: Float[Array, ""]
 
-    def twist(
-        self, wheel_speed: Float[Array, " wheel"], near: Float[Array, "3"] | None = None
-    ) -> Float[Array, "3"]:
-        """Return the body twist at given wheel speeds [rad/s] (vx, vy [m/s], yaw rate [rad/s]).
-
-        `near` is as in `contact.equilibrium`.
-        """
+    def contact(self, wheel_speed: Float[Array, " wheel"]) -> contact.ContactProblem:
+        """Return the contact problem at given wheel speeds [rad/s]."""
         rim = self.frame.radius * wheel_speed
-        return contact.equilibrium(rim, self.frame, self.floor, self.rest, near)
+        return contact.ContactProblem(rim, self.frame, self.floor, self.rest)
+
+    def twist(self, wheel_speed: Float[Array, " wheel"]) -> Float[Array, "3"]:
+        """Return the body twist at given wheel speeds [rad/s] (vx, vy [m/s], yaw rate [rad/s])."""
+        rim = self.frame.radius * wheel_speed
+        return contact.equilibrium(rim, self.frame, self.floor, self.rest)
 
     def motor_forces(
         self, xi: Float[Array, "3"], wheel_speed: Float[Array, " wheel"]
     ) -> Float[Array, "wheel 2"]:
-        """Return the forces along the drive of each wheel that motors work against [mean(mu) m g].
+        """Return the two forces at each wheel that its motor works against [mean(mu) m g].
 
-        They are the traction, and the rolling drag for `Motor.rolling_drag` 1. At that value a
-        wheel that rolls along its drive has as much drag as its rollers have; this drag exerts no
-        force on the body.
+        They are the traction, and the rolling drag that would result from `Motor.rolling_drag` = 1.
+        At that value a wheel that rolls in its drive direction has as much drag as its rollers
+        have. The rolling drag exerts no force on the body.
         """
         on = stand(self.frame, self.floor, self.rest)
-        balance, at = Balance(self.frame.radius * wheel_speed, on), Planar(*xi)
-        return jnp.stack([balance.motor_force(at), balance.rolling_drag(at)], axis=-1)
+        at = Balance(self.frame.radius * wheel_speed, on).at(Planar(*xi))
+        return jnp.stack([at.motor_force, at.rolling_drag], axis=-1)
 
     @property
     def lever(self) -> Float[Array, ""]:
@@ -275,8 +276,8 @@ def steady_states(
 ) -> SteadyStates:
     """Return the steady motions at wheel speeds of the drives [rad/s].
 
-    `surface` and `load` are indices of the floors and the load set-ups. Nothing is compiled for
-    another number of rows.
+    `surface` and `load` are indices of the floors and the load set-ups. A call with another number
+    of rows compiles nothing anew.
     """
     places = (np.broadcast_to(np.asarray(x), len(wheel_speed)) for x in (surface, load))
     return SteadyStates(*in_blocks(partial(_steady_states, robot), wheel_speed, *places))

@@ -16,7 +16,7 @@ class Planar(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """A 3x3 matrix by its columns: the derivative of a force by a twist, of any batch shape."""
+    """A 3x3 matrix by its columns, such as the derivative of a force with respect to a twist."""
 
     x: Planar
     y: Planar

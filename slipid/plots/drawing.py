@@ -37,7 +37,7 @@ def panels(count: int, width: float, height: float, title: str) -> tuple[Figure,
     """Return a figure with `count` panels of the same size [inch], in rows of at most four."""
     columns = min(count, 4 if count != 5 else 3)
     rows = math.ceil(count / columns)
-    # The figure is wide enough for the title even with a single panel.
+    # at least 8.8 inch, so that the title has room above a single panel
     made = figure(max(width * columns, 8.8), height * rows + 0.6, title)
     axes = list(made.subplots(rows, columns, squeeze=False).flat)
     for spare in axes[count:]:

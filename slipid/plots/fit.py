@@ -160,7 +160,7 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
         ValueError: there is no such figure, or the runs lack the data for it.
     """
     if name not in FIGURES:
-        raise ValueError(f"no figure '{name}'; there are {', '.join(FIGURES)}")
+        raise ValueError(f"no figure '{name}'; expected one of {', '.join(FIGURES)}")
     made = FIGURES[name](fit, data, measured_windows(fit.robot, data, fit.channels.windows))
     if made is None:
         raise ValueError(f"figure '{name}': the runs lack the data for it")

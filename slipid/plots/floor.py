@@ -70,7 +70,7 @@ def _unknown(vector: VectorMap) -> Rectangle:
 def _outline(axes: Axes, patch: Patch, colour: str | None) -> None:
     """Draw a patch with its holes, filled with `colour`.
 
-    Without a colour only the edges are drawn, so as to be visible on light and dark.
+    Without a colour only the edges are drawn, in two shades that show on light and dark floors.
     """
     rings = [np.concatenate([ring, ring[:1]]) for ring in patch.rings]
     shape = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))

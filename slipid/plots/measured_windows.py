@@ -18,7 +18,7 @@ from slipid.predict.slip_model import body_twist
 STRAIGHT = 0.98
 """Smallest ratio of displacement to path length, by encoders, of a segment that is straight."""
 SHORTEST_PATH = 0.05
-"""Largest rim travel of a wheel in a segment at which its slip is too noisy to use [m]."""
+"""A wheel whose rim travels no farther than this in a segment has too noisy a slip to use [m]."""
 TURNING = 0.5
 """Smallest yaw per path length, by encoders, at which a segment counts as a turn [rad/m]."""
 
@@ -48,7 +48,7 @@ class MeasuredWindows:
         amps: measured current [A]; None if currents were not logged.
         amps_model: predicted current [A].
         torque: predicted traction torque at the wheel [N m].
-        drag_torque: predicted torque of the drag along the drive direction, against which the motor
+        drag_torque: predicted torque of the drag in the drive direction, against which the motor
             works in addition to traction [N m].
         unsigned: True if currents were logged as magnitudes.
     """
@@ -157,7 +157,7 @@ def by_heading(
 
 @jax.jit
 def _currents_and_drag(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
-    """Return predicted currents [A], and torques of the drag along the drive direction [N m]."""
+    """Return predicted currents [A], and torques of the drag in the drive direction [N m]."""
     motor_force = lk.predict(robot, b).motor_force
     force = robot.surfaces.friction[b.surface] * robot.body.mass * GRAVITY
     drag = robot.motor.rolling_drag * motor_force[..., 1]

@@ -141,7 +141,7 @@ def path_figure(
     handles = [
         axes[0].plot([], [], color=drawing.INK, lw=3.2, alpha=0.35, label="camera")[0],
         axes[0].plot([], [], color=drawing.BLUE, lw=1.4, marker="o", ms=4, label="predicted")[0],
-        axes[0].plot([], [], ":", color=drawing.ORANGE, lw=1.2, label="encoders alone")[0],
+        axes[0].plot([], [], ":", color=drawing.ORANGE, lw=1.2, label="only encoders")[0],
     ]
     made.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return made
@@ -174,7 +174,7 @@ class _Paths(NamedTuple):
 
 
 def _paths(model: ForceBalance, data: Runs) -> dict[int, _Paths]:
-    """Return the paths of every run, by its index."""
+    """Return the paths of every run, keyed by the run's index."""
     out: dict[int, _Paths] = {}
     robot = model.robot
     for w in replay.replay_windows(data, robot):

@@ -37,7 +37,7 @@ def interval_figure(found: Posterior) -> Figure:
     made = drawing.figure(
         8.8,
         1.6 + 0.2 * len(chosen),
-        "Posterior of each number relative to its prior\n"
+        "Posterior of each parameter relative to its prior\n"
         "(0: prior mean; gray band: its 90 % interval)",
     )
     ax = made.subplots()
@@ -52,7 +52,7 @@ def interval_figure(found: Posterior) -> Figure:
     ax.plot([], [], color=drawing.SHADE, lw=1.2, label="Gaussian approximation, 90 %")
     ax.set_yticks(at, [fit.space.names[k] for k in chosen], fontsize=8)
     ax.set_ylim(len(chosen) - 0.4, -0.6)
-    ax.set_xlabel("prior standard deviations (logarithm for positive numbers)")
+    ax.set_xlabel("prior standard deviations (of the logarithm for positive parameters)")
     ax.legend(loc="lower right", fontsize=8)
     return made
 
@@ -65,7 +65,7 @@ def pair_figure(found: Posterior) -> Figure:
         len(pairs),
         2.9,
         2.7,
-        "Numbers that depend on each other along a curve: draws (dots)\n"
+        "Parameters that depend on each other along a curve: draws (dots)\n"
         "and the 90 % ellipse of the Gaussian approximation",
     )
     some = z[:: max(1, len(z) // 1500)]
@@ -82,7 +82,7 @@ FIGURES = {"intervals": interval_figure, "pairs": pair_figure}
 
 
 def curved_pairs(z: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs of coordinates of draws that depend on each other most strongly in a curve.
+    """Return the pairs of coordinates whose draws have the strongest curved dependence.
 
     In the first pair, the square of one coordinate explains most of the other. Each coordinate is
     in at most one pair.
@@ -118,7 +118,7 @@ def profile_figure(found: Sequence[Profile]) -> Figure:
         len(found),
         5.4,
         4.4,
-        "Rise of the loss if a number is fixed at another value and all others are refitted",
+        "Rise of the loss if a parameter is fixed at another value and all others are refitted",
     )
     for ax, profile in zip(axes, found, strict=True):
         _panel(ax, profile)
@@ -128,9 +128,7 @@ def profile_figure(found: Sequence[Profile]) -> Figure:
 
 
 def _panel(ax: Axes, p: Profile) -> None:
-    ax.plot(
-        p.value, p.likelihood, "o-", color=drawing.BLUE, label="data (without the number's prior)"
-    )
+    ax.plot(p.value, p.likelihood, "o-", color=drawing.BLUE, label="data (without this prior)")
     ax.plot(p.value, p.posterior, "s--", color=drawing.GREEN, ms=4, label="data and prior")
     ax.plot(p.value, p.laplace, ":", color=drawing.INK, label="Laplace")
     ax.axhline(RISE, color=drawing.SHADE, lw=1)

@@ -15,7 +15,7 @@ from slipid.plots.measured_windows import MeasuredWindows
 from slipid.plots.motion import named
 
 SIDEWAYS_COLOUR = "#35B779"
-"""Colour of the curve of a wheel whose sideways speed equals its rim speed, and of such dots."""
+"""Colour of the curve and the dots of wheels whose sideways speed equals their rim speed."""
 AT_REST = 0.05
 """Largest ratio of a wheel's speed to that of the fastest wheel at which it counts as at rest."""
 TOO_SLOW = 0.3
@@ -170,7 +170,7 @@ def current_figure(measured: MeasuredWindows) -> Figure | None:
             if column == 0:
                 ax.set_ylabel(f"wheel {wheel + 1}\ncurrent [A]")
         axes[0, column].set_title(named(surface, load, groups))
-        axes[-1, column].set_xlabel("predicted traction\nalong the turning [N m]")
+        axes[-1, column].set_xlabel("predicted traction torque\nalong the wheel's motion [N m]")
     assert drawn is not None
     bar = made.colorbar(drawn, ax=axes, pad=0.01, aspect=50)
     bar.set_label("wheel speed [rad/s]")

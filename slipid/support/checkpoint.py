@@ -79,8 +79,8 @@ class Checkpoint:
 
     Attributes:
         folder: folder of the files; it is made with the first part.
-        key: hash of everything that the parts depend on (see `key_of`), by which parts of other
-            jobs are recognised.
+        key: hash of everything that the parts depend on (see `key_of`); files with another key are
+            parts of other jobs.
     """
 
     folder: Path
@@ -120,7 +120,7 @@ class Checkpoint:
         return None
 
     def remove(self, pattern: str = "*") -> None:
-        """Delete the files that match a glob, also those of other jobs.
+        """Delete the files that match a glob, including files of other jobs.
 
         The folder is deleted, too, if it is then empty.
         """

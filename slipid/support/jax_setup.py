@@ -12,10 +12,11 @@ PLAIN_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 def plain_loops() -> None:
     """Make XLA compile loops without its fusion emitters, unless XLA_FLAGS already mentions them.
 
-    The compilation of a fit then takes three quarters of the time, and the fit runs as fast;
+    The compilation of a fit then takes three quarters of the time, and the fit itself is no slower;
     rollouts of the twin take 0.3 to 0.6 of the time. The function must be called before the first
     computation of JAX. XLA ends the process at unknown flags, so the flag is set only for versions
-    of jaxlib with which this was measured. If XLA_FLAGS names a file of flags, it is not changed.
+    of jaxlib with which this was measured. If XLA_FLAGS names a file of flags, XLA_FLAGS stays
+    unchanged.
     """
     flags = os.environ.get("XLA_FLAGS", "").strip()
     more = "fusion_emitters" not in flags and (not flags or flags.startswith("-"))
@@ -26,10 +27,11 @@ def plain_loops() -> None:
 def one_blas_thread() -> None:
     """Make BLAS and LAPACK compute in one thread.
 
-    The matrices of slipid are small. Their threads wait for each other in busy loops, so that on
-    two cores with another job the Cholesky factor of a 570 x 570 matrix takes 800 ms, not 3 ms.
+    The matrices of slipid are small. Several BLAS threads would wait for each other in busy loops:
+    on two cores with another job, the Cholesky factor of a 570 x 570 matrix takes 800 ms with them,
+    and 3 ms in one thread.
     """
-    import scipy.linalg  # noqa: F401  # loads what JAX computes with
+    import scipy.linalg  # noqa: F401  # loads the BLAS that JAX calls, so that the limit applies
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1, user_api="blas")

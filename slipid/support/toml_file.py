@@ -57,7 +57,7 @@ def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
         model: type of the result.
 
     Raises:
-        DataError: the mapping does not fit the model; every mistake is a line of the message.
+        DataError: the mapping does not match the model; every mistake is a line of the message.
     """
     try:
         return TypeAdapter(model).validate_python(mapping)
@@ -131,7 +131,7 @@ def _below(here: object, step: Step) -> object:
 
 
 def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[object]:
-    """Return the models and dataclasses that may describe a place in the file.
+    """Return the models and dataclasses that may describe the value at a location in the file.
 
     Of the members of a union, only those whose literals (such as `drive = "omni"`) match the file
     are returned.
@@ -171,7 +171,7 @@ def _annotations(kind: object) -> dict[str, object]:
 
 
 def _fits(kind: object, here: object) -> bool:
-    """Return whether the values in the file are among those of the type's `Literal` keys."""
+    """Return True if every `Literal` key of the type has one of its allowed values in the file."""
     return all(
         here[key] in get_args(annotation)
         for key, annotation in _annotations(kind).items()

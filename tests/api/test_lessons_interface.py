@@ -81,7 +81,7 @@ def test_a_closed_loop_run_prints_its_path_errors(fit):
     assert found.run.pose.shape == found.run.estimated_pose.shape
     assert f"{found.metrics.closure_mm:.0f} mm from the end of the path" in str(found)
     with pytest.raises(
-        ValueError, match="controller 'magic' from start 0; expected one of encoder"
+        ValueError, match="unknown controller 'magic' or start 0; expected one of encoder"
     ):
         sl.drive(robot, "magic")
     with pytest.raises(sl.DataError, match="no path 'square'"):

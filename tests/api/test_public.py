@@ -31,7 +31,7 @@ def test_pictures_and_predictions(world):
     assert {"intervals", "pairs"} == {
         n for n in ("intervals", "pairs") if world["posterior"].plot(n)
     }
-    with pytest.raises(ValueError, match="no figure 'nonsense'; there are slip_by"):
+    with pytest.raises(ValueError, match="no figure 'nonsense'; expected one of slip_by"):
         fit.plot("nonsense")
     found = fit.validate(world["runs"])
     assert "identified" in str(found)

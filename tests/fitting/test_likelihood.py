@@ -512,7 +512,7 @@ def test_scoring_steps_end_where_the_loss_is_level_in_electric_noise(truth, amme
     )
     z, keep, target = problem.space.start, jnp.ones(len(w)), problem.objective
     log_v = np.asarray(target.typical)
-    blocks, _, motor_force = linear(target, z, problem.electric(z, log_v))
+    blocks, _, motor_force, _ = linear(target, z, problem.electric(z, log_v))
     certain = {k: jnp.zeros((*r.shape, r.shape[1])) for k, r in blocks.items()}
     for _ in range(60):
         told = problem.voltage_information(z, log_v, motor_force)

@@ -6,7 +6,6 @@ import gc
 import weakref
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +15,7 @@ from scipy.linalg import block_diag
 from slipid.fitting import problem as of_problem
 from slipid.fitting import variances
 from slipid.fitting.optimise import LinearisedResiduals, _stacked, levenberg, optimise
-from slipid.fitting.problem import FitState, Problem, effects_given, without_effects
+from slipid.fitting.problem import FitState, Problem, Twists, effects_given, without_effects
 from slipid.fitting.variances import DEGREES
 from slipid.search_space import Choice
 from tests.helpers.dense import of_shared
@@ -300,22 +299,20 @@ def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fi
 # what is compiled
 
 
-def test_steps_of_the_solver_go_down_the_valley_of_rosenbrock(monkeypatch):
+def test_steps_of_the_solver_go_down_the_valley_of_rosenbrock():
     """A function whose first undamped steps go uphill; each accepted step must lower it."""
+    start, twists = np.array([-1.2, 1.0]), Twists(np.zeros((1, 1, 3)), None, None)
 
-    def residuals(fixed, y):
-        a, b = fixed.z + y
-        return LinearisedResiduals(
-            np.array([10 * (b - a**2), 1 - a]), np.array([[-20 * a, 10.0], [-1.0, 0.0]])
-        )
+    def residuals(y, near):
+        a, b = start + y
+        slopes = np.array([[-20 * a, 10.0], [-1.0, 0.0]])
+        return LinearisedResiduals(np.array([10 * (b - a**2), 1 - a]), slopes, near)
 
-    monkeypatch.setattr("slipid.fitting.optimise.linearised", residuals)
-    fixed = SimpleNamespace(z=np.array([-1.2, 1.0]), mask=np.ones(2), prior_std=np.ones(2))
-    ends = [levenberg(fixed, steps) for steps in range(1, 40)]
-    losses = [residuals(fixed, end - fixed.z).loss for end in ends]
-    assert losses[0] < residuals(fixed, np.zeros(2)).loss
+    ends = [levenberg(residuals, 2, twists, steps)[0] for steps in range(1, 40)]
+    losses = [residuals(end, twists).loss for end in ends]
+    assert losses[0] < residuals(np.zeros(2), twists).loss
     assert all(b < a or a < 1e-15 for a, b in pairwise(losses))
-    np.testing.assert_allclose(ends[-1], [1.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(start + ends[-1], [1.0, 1.0], atol=1e-6)
 
 
 def test_a_problem_is_forgotten_after_use_and_those_like_it_compile_nothing(truth):

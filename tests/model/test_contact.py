@@ -115,12 +115,11 @@ class Forces(NamedTuple):
 
 
 def forces_of(xi, rim, frame, floor, rest):
-    at, balance = Planar(*xi), Balance(rim, stand(frame, floor, rest))
-    roll = frame.roll @ xi - rim * frame.roller_share
-    drag = balance.wheels(frame.hold @ xi, roll).drag.force()
-    x, y, moment = balance.force(at)
+    at = Balance(rim, stand(frame, floor, rest)).at(Planar(*xi))
+    drag = at.wheels.drag.force
+    x, y, moment = at.force
     residual = jnp.stack([x, y, moment / frame.base])
-    return Forces(balance.motor_force(at), -balance.load(at) * drag, balance.share(at), residual)
+    return Forces(at.motor_force, -at.load * drag, at.share, residual)
 
 
 @eqx.filter_jit
@@ -216,7 +215,7 @@ def test_the_jacobian_is_the_derivative_of_the_balance(name):
         def force(x):
             return jnp.stack(balance.force(Planar(*x)))
 
-        return jnp.stack([jnp.stack(c) for c in balance.jacobian(Planar(*x))], 1), jax.jacfwd(
+        return jnp.stack([jnp.stack(c) for c in balance.at(Planar(*x)).jacobian()], 1), jax.jacfwd(
             force
         )(x)
 
@@ -603,7 +602,7 @@ def test_friction_of_an_ordinary_wheel_is_no_larger_than_its_load(seed):
     along, roll, rim = (jnp.asarray(rng.normal(0, 0.5, 50)) for _ in range(3))
     floor, onset = law.sideways(surface(creep=0.1, slide_viscosity=1e-12), jnp.ones(()))
     w = law.wheel_forces(along, roll, rim, jnp.ones(()), onset, floor, jnp.ones(()))
-    push, drag = np.asarray(w.traction.force()), -np.asarray(w.drag.force())
+    push, drag = np.asarray(w.traction.force), -np.asarray(w.drag.force)
     slide = np.asarray(rim - along)
     assert (np.hypot(push, drag) <= 1 + 1e-9).all()
     assert np.hypot(push, drag).max() > 0.9
@@ -633,7 +632,7 @@ def test_mecanum_goes_sideways():
 
 def rolling_drag(xi, rim, frame, floor, rest):
     """Drag of each wheel along its drive that only its motor works against."""
-    return Balance(rim, stand(frame, floor, rest)).rolling_drag(Planar(*xi))
+    return Balance(rim, stand(frame, floor, rest)).at(Planar(*xi)).rolling_drag
 
 
 def test_a_wheel_drags_along_its_drive_as_far_as_it_rolls_that_way():

@@ -56,7 +56,7 @@ def one_by_one(kind, rim):
     def of(under):
         floor = floors.at(under)
         xi = contact.equilibrium(rim, frame, floor, rest)
-        return xi, Balance(rim, stand(frame, floor, rest)).motor_force(Planar(*xi))
+        return xi, Balance(rim, stand(frame, floor, rest)).at(Planar(*xi)).motor_force
 
     xi, pull = jax.vmap(of)(index)
     return xi.T, pull.T

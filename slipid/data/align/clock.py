@@ -35,7 +35,7 @@ FINE_GRID_S, FINE_HALF_WIDTH_S = 0.01, 0.2
 """Grid spacing and half width of the second search, which has a noise model, around the offset that
 the first search found [s]."""
 LEAST_OVERLAP_S = 1.0
-"""Shortest overlap of both records at the offsets that are searched [s]."""
+"""Shortest overlap of the record of poses with the robot's record at any searched offset [s]."""
 DRIFT_STD, WIDE_DRIFT_STD = 1e-4, 1e-2
 """Prior stds of the drift [1]: the first is larger than the error of any quartz clock; the second
 replaces it if the motion contradicts it, for example because the declared frame rate is wrong."""

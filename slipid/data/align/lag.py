@@ -9,8 +9,8 @@ from slipid.data.align.regression import MotionPair, clear_best, unexplained
 from slipid.data.runs import Runs
 
 LONGEST_LAG_S, LEAST_OVERLAP = 8.0, 0.3
-"""Largest searched lag of either sign [s], and share of a median run in which poses and encoders
-must still overlap [1]."""
+"""Largest searched lag of either sign [s], and fraction of the median run's duration in which poses
+and encoders must still overlap [1]."""
 COARSE_GRID_S, FINE_GRID_S = 0.1, 0.01
 """Grid spacings of the first and of the second search [s]."""
 STEP_S = 0.2

@@ -6,9 +6,9 @@ where moved_k is the pose increment over step k, from first_k to last_k [s], tur
 of the wheels or of the gyro, B is the fitted matrix and e_k the noise. Sizes, signs and order of
 the wheels need not be known, since B absorbs them. The speed must change during the motion, because
 steady motion looks the same at any offset. A search compares offsets by the unexplained share of
-the motion; near the best offset, `linearised` gives the derivatives by offset and drift under a
-noise model, in which e is the sum of pose noise, which successive steps share, and of slip, which
-is independent in each step.
+the motion; near the best offset, `linearised` gives the derivatives with respect to offset and
+drift under a noise model, in which e is the sum of pose noise, which successive steps share, and of
+slip, which is independent in each step.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,8 @@ class PoseIncrements:
 
     Attributes:
         first, last: begin and end of each step on the clock of the poses [s].
-        moved: increments of the pair's `components` of ahead [m], left [m] and heading [rad].
+        moved: increments in the `components` that the `MotionPair` compares, out of ahead [m], left
+            [m] and heading [rad].
     """
 
     first: Float[np.ndarray, " step"]
@@ -79,8 +80,8 @@ class MotionPair:
         """Return the motion pair of wheels and poses.
 
         Steps are longer than the time in which a roller passes under an omni wheel. While a robot
-        accelerates, its wheels slip more and a soft floor gives way, which the data cannot
-        distinguish from a delay of the body: some 10 ms on firm floors, more on carpets. Therefore
+        accelerates, its wheels slip more and a soft floor gives way. The data cannot distinguish
+        this from a delay of the body: some 10 ms on firm floors, more on carpets. Therefore
         `body_std` is 15 ms.
         """
         robot = time, angle, pose_time, pose
@@ -154,12 +155,13 @@ clear best offset."""
 def unexplained(
     pairs: Sequence[MotionPair], offsets: Float[np.ndarray, " offset"], step: float
 ) -> Float[np.ndarray, " offset"]:
-    """Return, for each offset [s], the share of the motion that one B for all pairs cannot explain.
+    """Return the share of the motion that the regression leaves unexplained at each offset.
 
-    It is the geometric mean of the unexplained shares of the components, which ranks offsets as the
-    profile likelihood does if each component has a separate noise variance. Therefore units do not
-    matter, and a component that cannot be explained, such as the sideways motion of a robot with
-    two wheels, does not hide the others.
+    One matrix B is fitted to all pairs. The result is the geometric mean of the unexplained shares
+    of the components, which ranks offsets as the profile likelihood does if each component has a
+    separate noise variance. Therefore units do not matter, and a component that cannot be
+    explained, such as the sideways motion of a robot with two wheels, does not hide the other
+    components.
 
     Args:
         pairs: motion pairs.
@@ -242,7 +244,7 @@ class Linearised:
 
     Attributes:
         residual: weighted residuals.
-        slope: derivatives of the residuals by offset and drift, with B profiled out.
+        slope: derivatives of the residuals with respect to offset and drift, with B profiled out.
         share: share of the motion that is unexplained [1].
         noise: noise of each component, estimated from the residuals.
     """

@@ -24,7 +24,7 @@ from slipid.support.errors import DataError
 MADE_REDUNDANT_BY = ("wheel_sign", "wheel_order", "command_sign", "command_order")
 """Kinds of findings from poses that make a `wheel_columns` finding redundant."""
 CAUSED_BY_ORDER = ("wheel_scale", "wheel_speed_unit")
-"""Kinds of findings that may only be consequences of a wrong order of columns. They are left out if
+"""Kinds of findings that may only be consequences of a wrong order of columns. They are omitted if
 there is a `wheel_columns` finding; once its remedy is applied, the next check reports them if they
 are real."""
 STEP_S = 0.5
@@ -46,9 +46,9 @@ in which the declared measured speed changes [1]."""
 
 
 def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
-    """Yield a finding for every channel and order in which its columns fit the encoders.
+    """Yield a finding for every speed channel whose columns match the encoders in another order.
 
-    Only orders other than the declared one are findings.
+    Runs in which a channel matches in the same order share one finding.
     """
     found: dict[tuple[str, tuple[int, ...]], list[str]] = {}
     for log in logs:
@@ -67,16 +67,16 @@ def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
 
 
 def refuse_misordered(logs: Sequence[Log]) -> None:
-    """Raise `DataError` with all findings of `misordered`.
+    """Raise `DataError` with all findings of `misordered`, if there are any.
 
-    Used by commands that do not run the whole check.
+    Commands that do not run the whole check call it.
     """
-    if listed := "\n".join(f"not used: {finding}" for finding in misordered(logs)):
+    if listed := "\n".join(f"logs not used: {finding}" for finding in misordered(logs)):
         raise DataError(listed)
 
 
 def _orders(log: Log) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yield each channel of a run that fits the encoders only in another order, with that order."""
+    """Yield the speed channels that match the encoders only in another order, with that order."""
     edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / STEP_S) + 1))
     measured: Float[np.ndarray, "step wheel"] | None = None
     for name in SPEED_CHANNELS:
@@ -156,8 +156,8 @@ def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
 SHARE_IF_REVERSED = -0.25
 """Share of work (see `_share`) below which the sign of a current or voltage is wrong [1]."""
 SHARE_IF_ORDERED = 0.4
-"""Another order of the columns is a finding if every wheel's share of work exceeds this, and their
-sum exceeds that of the declared order with the best signs by as much [1]."""
+"""Another order of the columns is a finding if every wheel's share of work exceeds this, and the
+sum of the shares exceeds the sum for the declared order with the best signs by as much [1]."""
 SHARE_OF_POWER = 0.1
 """A current has the sign of the power, not of the torque, if its share of work is above this while
 wheels turn forwards and below its negative while they turn backwards [1]."""
@@ -189,7 +189,7 @@ def electric(
         meant: the right order and signs of the wheels.
         radius: radius of the wheels [m].
         mass_kg: mass of the robot [kg], or None if it is unknown.
-        by_power: True if no scale is wrong, so that the power can be compared with the speed.
+        by_power: True if no wrong scale was found, so that power can be compared with speed.
     """
     declared = _speeds(data)
     speed = declared @ columns(meant, data.wheels).T
@@ -281,7 +281,7 @@ def _sign_findings(
         f"the {name} of {which} has the wrong sign: its product with the wheel speed, which "
         f"should be mostly positive, sums to {share[turned].min():+.2f} of its magnitude",
         f"set scale = -1 for {'the channel' if every else 'its column of the channel'} {name}, "
-        "if it is 1 (else turn its sign)",
+        "if it is 1 (else reverse its sign)",
     )
 
 
@@ -292,8 +292,8 @@ def _other_order(
 ) -> tuple[int, ...] | None:
     """Return the column of each wheel if another order explains more than other signs, else None.
 
-    If the columns match the declared order of the encoders, there is no finding here: if that order
-    is wrong, the finding is about the encoders.
+    The result is also None if the columns match those of the encoders as declared, even if the
+    encoders are in a wrong order, because then the finding is about the encoders.
     """
     share, as_declared = (
         _share(np.nan_to_num(values[:, None] * one[:, :, None])) for one in (speed, declared)

@@ -96,7 +96,7 @@ def mistake_finding(mistake: Mistake) -> Finding:
 
 
 def _candidate_finding(candidate: Candidate) -> Finding:
-    """Return the finding about one candidate, which differs in order, signs or axes."""
+    """Return the finding about the mistake in order, signs or axes that a candidate corrects."""
     kind, meant = candidate.kind, candidate.meant
     if kind == "wheel_sign":
         return _sign_finding(kind, meant.sign, "")
@@ -138,18 +138,18 @@ def _sign_finding(kind: str, sign: Sequence[int], commanded: str) -> Finding:
     return Finding(
         kind,
         f"the {commanded}rotation of {wheels} has the opposite sign of the motion",
-        f"set scale = -1 for {column}{' in the commanded speeds' if commanded else ''}, if it is "
-        "1 (else reverse its sign)",
+        f"reverse the sign of scale for {column}{' in the commanded speeds' if commanded else ''} "
+        "(scale = -1 if no scale is set)",
     )
 
 
 def _order_finding(kind: str, order: Sequence[int], columns: str) -> Finding:
-    """Return the finding about columns, which `columns` names, in another order than the wheels."""
+    """Return the finding that columns, described by the text `columns`, are in a wrong order."""
     listed = ", ".join(str(k + 1) for k in order)
     return Finding(
         kind,
         f"{columns} are in another order than the wheels of [robot]",
-        f"list the columns in the order {listed} (numbers of their present places)",
+        f"list the columns in the order {listed} (numbers of their present positions)",
     )
 
 
@@ -168,7 +168,7 @@ def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
         "heading_quaternion": "log the yaw, 2 atan2(qz, qw), and name its column in the channel "
         "pose_heading",
         "heading_sign": f"reverse the sign of scale for the channel pose_heading{offset}",
-        "pose_axis": "turn the sign of scale for the channel pose_"
+        "pose_axis": "reverse the sign of scale for the channel pose_"
         + ("x" if abs(turn) == 180 else "y"),
         "pose_swapped": "exchange the columns of the channels pose_x and pose_y",
         "pose_mirrored": "reverse the sign of scale for pose_y and pose_heading (or for pose_x and "
@@ -182,12 +182,12 @@ def cause_findings(
 ) -> tuple[Finding, ...]:
     """Return findings about wrong factors, from ratios outside their ranges.
 
-    If causes fit alone, the likeliest one is the finding and others are alternatives in its text;
-    if two causes fit only together, both are findings.
+    If single causes explain the ratios, the likeliest one is the finding and the other causes are
+    alternatives in its text; if only two causes together explain the ratios, both are findings.
 
     Args:
-        fitting: causes that fit, the likeliest first.
-        single: True if each of these causes fits alone.
+        fitting: causes that explain the ratios, the likeliest first.
+        single: True if each of these causes explains all ratios without another cause.
         scales: ratios by name.
         gear_ratio: gear ratio of the declared robot.
     """
@@ -277,7 +277,7 @@ def _turns(factor: float, gear_ratio: float) -> str:
 
 
 def _unit_of_rate(factor: float) -> str:
-    """Return a text that names two confused units if a factor is their ratio, else no text."""
+    """Return a text that names two confused units if a factor is their ratio, else an empty one."""
     names = {
         30 / pi: ": 'rpm' was taken for 'rad/s'",
         pi / 30: ": 'rad/s' was taken for 'rpm'",
@@ -291,5 +291,5 @@ def _unit_of_rate(factor: float) -> str:
 
 
 def _unit_name(factor: float, names: Mapping[float, str]) -> str:
-    """Return the name of a factor that occurs in `names` to 0.1 %, else an empty text."""
+    """Return the text in `names` whose key equals the factor within 0.1 %, else an empty text."""
     return next((name for f, name in names.items() if isclose(f, factor, rel_tol=1e-3)), "")

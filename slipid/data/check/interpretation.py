@@ -1,8 +1,9 @@
 """Interpretations of the logs: order and signs of the wheels' columns, and the axes of the poses.
 
 The declared interpretation is compared with candidates, which differ from it by single mistakes.
-The misfit of an interpretation is a sum of unexplained shares, each from 0 to 1. They do not depend
-on lengths, so that slip, which shortens the motion, does not count against the true interpretation:
+The misfit of an interpretation is a sum of unexplained shares, each from 0 to 1. The shares do not
+depend on the length of the motion, so that slip, which shortens it, does not count against the true
+interpretation:
 
     pose, and commanded twist   body increments along each axis that the wheels do not explain
     wheels                      rotations impossible for a rigid body (with more than three wheels)
@@ -90,8 +91,8 @@ class Evidence:
     """Sums of products from which the misfit of every interpretation is computed.
 
     Attributes:
-        rolling: J / r, turns of each wheel per body increment without slip (wheel, 3) [rad/m]; the
-            heading increment is an arc in metres at the base radius.
+        rolling: turns of each wheel per body increment without slip, the Jacobian over the wheel
+            radius (wheel, 3) [rad/m]; the heading increment is an arc in metres at the base radius.
         base: base radius [m].
         pose: products of the turns as declared with the body increments from the poses, for each
             convention without offset.
@@ -160,7 +161,7 @@ def _commanded(moved: ChannelIncrements) -> Commanded | None:
 
 
 def misfits(evidence: Evidence, meant: Interpretation) -> dict[str, float]:
-    """Return the unexplained share of each compared channel by its name."""
+    """Return the unexplained share of each compared channel, keyed by the name of the channel."""
     convention = meant.convention
     bare = convention.bare
     pose = evidence.pose.get(bare)
@@ -181,7 +182,7 @@ def misfits(evidence: Evidence, meant: Interpretation) -> dict[str, float]:
 
 
 def columns(meant: Interpretation, wheels: int) -> Float[np.ndarray, "wheel wheel"]:
-    """Return the signed permutation that takes the declared columns to the true wheels."""
+    """Return the signed permutation matrix that maps the declared columns to the true wheels."""
     order, sign = meant.order or tuple(range(wheels)), meant.sign or (1,) * wheels
     out = np.zeros((wheels, wheels))
     out[np.arange(wheels), list(order)] = sign
@@ -224,9 +225,8 @@ def _unexplained(
         return 1.0
     moves = predicted > LEAST_MOTION * total
     explained = np.where(moves, both.clip(0) ** 2 / np.where(moves, predicted, 1.0), 0.0)
-    if (
-        not free and moves[:2].any()
-    ):  # All wheels roll in one direction, so one factor applies to both axes.
+    # If all wheels roll in one direction, a single factor applies to both axes of translation.
+    if not free and moves[:2].any():
         explained[:2] = 0.5 * max(both[:2].sum(), 0.0) ** 2 / predicted[:2].sum()
     along = 1.0 - explained[:2].sum() / max(measured[:2].sum(), 1e-300)
     about = 1.0 - explained[2] / max(measured[2], 1e-300)

@@ -46,7 +46,7 @@ class JoinedChannel:
     value: Float[np.ndarray, "row column"]
 
     def at(self, when: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
-        """Return the values at other times on the clock [s], interpolated linearly."""
+        """Return the values at other times on the common time axis [s], interpolated linearly."""
         return interpolate(self.time, self.value, when)
 
 
@@ -61,8 +61,9 @@ class JoinedRuns:
         row: median time between rows of each run (run,) [s].
         angle: angle of each wheel [rad].
         pose: x [m], y [m], heading [rad], only rows with a new pose.
-        channels: channels that some run has, by the name that `Log` has for them; of the rates
-            in `INTEGRATED` their integrals [rad, m], of currents [A] and voltages [V] the values.
+        channels: channels that some run has, keyed by the name of their attribute in `Log`:
+            integrals [rad, m] of the rates in `INTEGRATED`, and values of currents [A] and voltages
+            [V].
         current_is_signed: False if some run has only magnitudes of currents.
     """
 
@@ -81,7 +82,7 @@ class JoinedRuns:
         return self.angle.value.shape[1]
 
     def runs_of(self, when: Float[np.ndarray, " at"]) -> Int[np.ndarray, " at"]:
-        """Return the index of the run at each time on the clock [s]."""
+        """Return the index of the run at each time on the common time axis [s]."""
         return np.searchsorted(self.begin, when + 1e-9, side="right") - 1
 
 
@@ -90,7 +91,7 @@ class StepEdges:
     """Time steps over which motion is compared, with the poses at their begin and end.
 
     Attributes:
-        before: begin of each step on the clock of `JoinedRuns` (step,) [s].
+        before: begin of each step on the time axis of `JoinedRuns` (step,) [s].
         after: end of each step (step,) [s].
         run: index of the run of each step (step,).
         pose_before: pose at the begin, as logged (step, 3).
@@ -106,7 +107,7 @@ class StepEdges:
 
 @dataclass(frozen=True, eq=False)
 class ChannelIncrements:
-    """Increments of all channels but the poses over the steps, shifted by the lag of the poses.
+    """Increments of the robot's channels (all but the poses) over steps shifted by the poses' lag.
 
     Attributes:
         wheels: rotation of each wheel [rad]; nan if it was not logged for the whole step.
@@ -122,7 +123,7 @@ class ChannelIncrements:
 
 
 def joined(data: Runs) -> JoinedRuns:
-    """Return the channels of all runs on a common clock, with a pause of 1 s between runs."""
+    """Return the channels of all runs on a common time axis, with a pause of 1 s between runs."""
     first = np.array([log.time[0] for log in data.logs])
     length = np.array([log.duration for log in data.logs])
     starts = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
@@ -235,7 +236,7 @@ def rotation(degrees: int) -> Float[np.ndarray, "3 3"]:
 
 
 def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, "step 3"]:
-    """Return increments ahead [m], left [m] and of the heading [rad], for a convention.
+    """Return increments ahead [m], left [m] and of the heading [rad], under a pose convention.
 
     The offset of the convention is not applied. Increments are nan where the logged heading is
     impossible under the convention.
@@ -244,7 +245,8 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
     before, after = at.pose_before * flip, at.pose_after * flip
     before[:, 2] = _heading(before[:, 2], convention.heading)
     turned = _heading(after[:, 2], convention.heading) - before[:, 2]
-    # The reader unwrapped headings as declared; under these conventions the wrap is elsewhere.
+    # The reader removed the wrap-around of the heading in its declared unit. Under these
+    # conventions the heading wraps elsewhere, so the turn of each step is wrapped to half a turn.
     if convention.heading in ("radians", "half_sine"):
         turned = np.mod(turned + np.pi, 2 * np.pi) - np.pi
     after[:, 2] = before[:, 2] + turned
@@ -254,7 +256,7 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
 def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.ndarray, " step"]:
     """Return the true heading [rad] for logged values with a given meaning."""
     if meaning == "half_sine":
-        # A value above 1 in magnitude, but for rounding, cannot be a sine.
+        # A magnitude above 1, apart from rounding, cannot be a sine: its heading is nan.
         return 2 * np.arcsin(np.where(np.abs(logged) <= 1.0 + 1e-3, logged.clip(-1, 1), np.nan))
     factor = {"turned_round": -1.0, "degrees": np.pi / 180, "radians": 180 / np.pi}
     return factor.get(meaning, 1.0) * logged

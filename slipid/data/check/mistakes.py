@@ -1,6 +1,6 @@
 """Search for single mistakes in order, signs and axes.
 
-A mistake is found if the logs fit far better with its correction than as declared.
+A mistake is found if the channels agree far better with its correction than as declared.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,8 @@ LEAST_REDUCTION = 0.05
 """Constant part of the least reduction of the misfit for which a mistake is accepted,
 `LEAST_REDUCTION` plus `REDUCTION_SHARE` times the remaining misfit [1]."""
 REDUCTION_SHARE = 0.3
-"""See `LEAST_GAIN` [1]; real logs without a mistake stay far below this reduction."""
+"""Factor in the least reduction (see `LEAST_REDUCTION`) [1]; in real logs without a mistake the
+reductions stay far below the least reduction."""
 MOST_UNEXPLAINED = 0.4
 """Largest share of the poses' motion that an accepted pose convention leaves unexplained [1]."""
 ALTERNATIVE_MARGIN = 0.02
@@ -75,7 +76,7 @@ def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
 
 
 def _next_mistake(evidence: Evidence, current: Interpretation) -> Mistake | None:
-    """Return the simplest mistake that explains the logs decisively better, or None."""
+    """Return the mistake whose correction explains the logs decisively better, or None."""
     before = sum(misfits(evidence, current).values())
     # Another convention of the poses is accepted only if the poses then follow the wheels.
     tried = [
@@ -160,7 +161,7 @@ def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], 
 def _orders(wheels: int) -> Iterator[tuple[tuple[int, ...], float]]:
     """Yield other orders of the wheels' columns, each with its cost.
 
-    The cost grows with the number of columns that are not in their declared place.
+    The cost grows with the number of columns that are not in their declared position.
     """
     declared = tuple(range(wheels))
     for order in permutations(declared) if wheels <= MOST_PERMUTED else _exchanges(declared):

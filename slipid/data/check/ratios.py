@@ -8,14 +8,14 @@ command     commanded wheel speeds over measured ones
 report      reported wheel speeds over those of the encoders
 gyro        rotation by the gyro over that of the poses
 
-A cause, such as a wrong unit, multiplies ratio i by its factor to a power e_i. The cause fits if
-one factor explains all ratios, that is, if ratio_i / factor^e_i lies in the range from low_i to
-high_i for every i:
+A cause, such as a wrong unit, multiplies ratio i by factor^e_i, where the exponents e_i are known
+and the factor is not. The cause explains the ratios if some factor brings all of them into their
+natural ranges, that is, if ratio_i / factor^e_i lies between low_i and high_i for every i:
 
     max_i  log(ratio_i / high_i) / e_i   <=   log factor   <=   min_i  log(ratio_i / low_i) / e_i
 
-(with low and high exchanged where e_i < 0). Of the causes that fit, those whose factor is a common
-error, such as 1000, 2 pi, 57.3 or the gear ratio, are preferred.
+(with low and high exchanged where e_i < 0). Of the causes that explain the ratios, those whose
+factor is a common error, such as 1000, 2 pi, 57.3 or the gear ratio, are preferred.
 """
 
 from collections.abc import Mapping
@@ -48,11 +48,12 @@ was computed from the speed [1]."""
 _Range = tuple[float, float, float]
 """Least, usual and largest natural value of a ratio [1]."""
 _WIDE: Mapping[str, _Range] = {
-    # A robot may slip in place on carpet, hence the small lower end (used if commands confirm the
-    # motion of the wheels). The scale of a camera may be wrong by an eighth.
+    # The lower end is small because a robot may slip in place on carpet; it is used if commands
+    # confirm the motion of the wheels. The upper end allows for a camera scale that is wrong by an
+    # eighth.
     "travel": (0.012, 0.8, 1.35),
     "turning": (0.35, 0.8, 1.35),
-    # Commands precede the motion, and exceed it if brakes or limits act.
+    # The upper ends are large because commands exceed the motion if brakes or limits act.
     "drive": (0.65, 1.1, 1.75),
     "steer": (0.65, 1.1, 1.75),
     "command": (0.7, 1.1, 1.75),
@@ -90,8 +91,8 @@ def ratios(
 ) -> tuple[dict[str, ScaleRatio], bool]:
     """Return the ratios under an interpretation whose order, signs and axes are right.
 
-    Ratios that cannot be computed are left out. The second result is whether the wheels' angle is
-    the integral of the reported speeds, so that the ratio `report` means nothing.
+    Ratios that cannot be computed are omitted. The second result is True if the wheels' angle is
+    the integral of the reported speeds, in which case the ratio `report` is omitted, too.
     """
     values: dict[str, float | None] = {}
     predict = to_body(evidence, meant)
@@ -121,8 +122,8 @@ def _along(
 ) -> tuple[float | None, float | None]:
     """Return least-squares ratios of measured to predicted motion, for translation and rotation.
 
-    A ratio is None if there is too little motion to compute it. The matrix `axes` takes the axes of
-    the measured body increments to the true ones.
+    A ratio is None if there is too little motion to compute it. The matrix `axes` maps the axes of
+    the measured body increments to the true axes.
     """
     predicted, both = sums.predicted(predict), sums.matched(predict, axes)
     total = predicted.sum()
@@ -130,7 +131,7 @@ def _along(
         return None, None
     ahead, about = predicted[:2].sum(), predicted[2]
     along = float(both[:2].sum() / ahead) if ahead > LEAST_TRANSLATION * total else None
-    # Small predicted rotations are hidden by rotations due to slip.
+    # Rotations due to slip may hide small predicted rotations, so a correlation of 0.5 is required.
     turns = about > LEAST_TURNING * total and both[2] ** 2 > 0.25 * about * sums.body[2, 2]
     return along, float(both[2] / about) if turns else None
 
@@ -178,8 +179,8 @@ def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
 
 
 MARGIN = 0.02
-"""Margin by which a common factor may lie outside the range of a fitting cause, in its logarithm
-[1]."""
+"""Margin in the logarithm by which a common factor may lie outside the range of factors that
+explain the ratios [1]."""
 USUAL_ROW_S = (0.001, 1.5)
 """Range of the time between rows in which the unit of time is not suspected [s]."""
 
@@ -190,9 +191,11 @@ class ScaledQuantity(NamedTuple):
     Attributes:
         kind: kind of the finding about it.
         text: name of the quantity in the text of the finding.
-        powers: power of the factor in every ratio that it changes, by the ratio's name; a factor
-            above 1 means that the values of the quantity's channels are too large.
-        common: factors that are common errors, such as ratios of units; so are their inverses.
+        powers: exponent of the factor in every ratio that the factor changes, keyed by the name of
+            the ratio; a factor above 1 means that the values of the quantity's channels are too
+            large.
+        common: factors that are common errors, such as ratios of units; their inverses are common
+            errors as well.
     """
 
     kind: str
@@ -269,10 +272,10 @@ class ScaleCause(NamedTuple):
 def single_causes(
     known: Mapping[str, ScaleRatio], speed_is_angle: bool, row_s: float, gear_ratio: float
 ) -> tuple[tuple[ScaleCause, ...], bool]:
-    """Return the causes that fit, the likeliest first, and whether each of them fits alone.
+    """Return the causes that explain the ratios, the likeliest first, and whether one suffices.
 
-    If no single cause fits, the first pair that fits together is returned. The result is empty if
-    every ratio is natural, or no pair of causes fits.
+    If no single cause explains all ratios, the first pair of causes that does so is returned. There
+    are no causes if every ratio is natural, or if no pair of causes explains the ratios.
 
     Args:
         known: ratios by name.
@@ -300,7 +303,10 @@ def single_causes(
 
 
 def _possible(speed_is_angle: bool, gear_ratio: float) -> dict[str, ScaledQuantity]:
-    """Return the quantities by name, with all their common factors; arguments as above."""
+    """Return the quantities by name, with all their common factors.
+
+    The arguments are those of `single_causes`.
+    """
     found = dict(QUANTITIES)
     if speed_is_angle:
         integrated = {"travel": -1.0, "turning": -1.0, "gyro": 1.0}
@@ -317,7 +323,7 @@ def _possible(speed_is_angle: bool, gear_ratio: float) -> dict[str, ScaledQuanti
 def _singles(
     known: Mapping[str, ScaleRatio], possible: Mapping[str, ScaledQuantity]
 ) -> list[ScaleCause]:
-    """Return the causes that fit alone, each with its likeliest factor."""
+    """Return the causes that explain all ratios by themselves, each with its likeliest factor."""
     found = []
     for name, quantity in possible.items():
         low, high = _range(known, quantity.powers)
@@ -333,7 +339,7 @@ def _singles(
 def _range(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> tuple[float, float]:
     """Return the least and largest log factor that bring every ratio into its range.
 
-    The least is above the largest if no factor does.
+    If no factor does so, the least is above the largest.
     """
     low, high = -inf, inf
     for name, ratio in known.items():

@@ -61,7 +61,8 @@ and wheels do not belong together [1]."""
 LATE_S = 1.0
 """Smallest magnitude of the lag of the poses that is a finding [s]."""
 TOO_LATE_S = 1.9
-"""A finding about a larger lag is `wrong`, since a fit would start too far from it [s]."""
+"""Magnitude of the lag above which its finding is `wrong`, because a fit would start too far from
+it [s]."""
 SLOW_M_S, SLOW_ROW_S = 0.01, 2.0
 """If the rim speed [m/s] is below and the time between rows [s] above these values, the unit of
 time is smaller than declared."""
@@ -80,8 +81,8 @@ class _Compared:
     Attributes:
         findings: findings about lag, order, signs, axes and single runs.
         moved: increments of the robot's channels, shifted by the lag of the poses.
-        evidence: sums of products of these increments and those of the body.
-        meant: the right interpretation.
+        evidence: sums of products of these increments with the body increments.
+        meant: the interpretation of the columns that agrees best with the logs.
         poses: True if the poses are usable for further comparisons.
     """
 
@@ -148,8 +149,8 @@ def _compared(
     left = misfits(evidence, meant)["pose"]
     if left > UNEXPLAINED_IF_FOREIGN:
         return _Compared((_foreign(left),), moved, evidence)
-    # sin(heading / 2) does not determine the heading beyond half a turn, so that single runs may
-    # seem to disagree.
+    # Findings about single runs are omitted if the logged heading is sin(heading / 2): it does not
+    # determine the heading beyond half a turn, so that correct runs may seem to disagree.
     half_sine = meant.convention.heading == "half_sine"
     agreeing = agreement(data, at, moved, evidence, meant)
     alone = () if half_sine else tuple(single_runs(data, agreeing))
@@ -192,8 +193,8 @@ def _of_time(
 ) -> Iterator[Finding]:
     """Yield the finding that time is in another unit than declared.
 
-    The evidence is an implausible rim speed and time between rows; ratios of channels may not show
-    it.
+    The evidence is an implausible rim speed and time between rows, because the ratios of channels
+    may not show a wrong unit of time.
     """
     row = float(np.median(data.row))
     speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * radius
@@ -208,7 +209,10 @@ def _of_time(
 
 
 def _suspicious(scales: Mapping[str, ScaleRatio]) -> Iterator[Finding]:
-    """Yield the finding that the wheels travel much further than the body, without a command."""
+    """Yield the finding that the wheels travel much further than the body, if no command is known.
+
+    A logged command would tell whether the wheels or the poses are wrong.
+    """
     travel = scales.get("travel")
     if travel is None or "drive" in scales or "command" in scales:
         return

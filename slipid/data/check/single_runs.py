@@ -78,7 +78,8 @@ def agreement(
     length = np.linalg.norm(body, axis=1)
     most = LONGEST_RATIO * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
     body = body * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
-    # Slip shortens the motion along each axis by a different factor.
+    # The prediction is scaled along each axis, because slip shortens the motion by a different
+    # factor along each.
     squares = (predicted**2).sum(axis=0)
     factor = (predicted * body).sum(axis=0) / np.where(squares > 0, squares, 1.0)
     scaled = predicted * np.where(factor > 0, factor, 0.0)
@@ -124,7 +125,7 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
         yield Finding(
             "pose_of_another_run",
             f"the poses of {odd.sum()} of {len(odd)} runs do not follow their wheels "
-            f"(agreement {np.median(compared.cosine[odd]):.2f}, in the others "
+            f"(agreement {np.median(compared.cosine[odd]):.2f}, in the other runs "
             f"{np.median(compared.cosine[moves & ~odd]):.2f})",
             "check whether these files contain poses of another run or of another time; if so, "
             "exclude them from the globs of [[logs]]",

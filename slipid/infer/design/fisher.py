@@ -1,14 +1,14 @@
 """Fisher information of sets of runs, and the choice of the most informative runs.
 
-As in the fit, motion residuals determine the numbers m of the motion; currents and voltages
-determine the electric numbers e given the motion. With the whitened Jacobian J of the motion by m,
-and those of currents and voltages, E by e and C by m,
+As in the fit, motion residuals determine the motion parameters m; currents and voltages determine
+the electric parameters e given the motion. Let J be the whitened Jacobian of the motion residuals
+with respect to m, and E and C those of currents and voltages with respect to e and to m. Then
 
     M = M0 + sum J^T J,   O = O0 + sum E^T E,   X = X0 + sum E^T C
     cov(m) = M^-1,   e = e(m) - L (m - m^),  L = O^-1 X,   cov(e) = O^-1 + L M^-1 L^T
 
-with M0, O0 and X0 from earlier runs and priors, so that M, O and X of different runs add. If no
-currents are logged, all numbers count as m. The criterion to be minimised is tr(G cov G^T), where
+with M0, O0 and X0 from earlier runs and priors, and sums over the new runs. If no currents are
+logged, all parameters count as m. The criterion to be minimised is tr(G cov G^T), where
 the matrix G selects the quantities of interest (Fedorov 1972; Atkinson, Donev and Tobias 2007,
 Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
 """
@@ -29,10 +29,10 @@ class RunJacobians(NamedTuple):
     """Whitened Jacobians of runs.
 
     Attributes:
-        motion: J, derivative of motion residuals by the numbers of the motion.
-        electric: E, derivative of currents and voltages by the electric numbers (k is 0 without
-            currents).
-        carried: C, derivative of currents and voltages by the numbers of the motion.
+        motion: J, derivative of motion residuals with respect to the motion parameters.
+        electric: E, derivative of currents and voltages with respect to the electric parameters (k
+            is 0 without currents).
+        carried: C, derivative of currents and voltages with respect to the motion parameters.
     """
 
     motion: Float[np.ndarray, "run m motion"]
@@ -49,13 +49,13 @@ class RunJacobians(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Fisher information about all numbers, as the matrices of the module docstring.
+    """Fisher information about all parameters, as the matrices of the module docstring.
 
     Attributes:
-        is_electric: mask of the electric numbers.
-        motion: M, information about the numbers of the motion.
-        own: O, information about the electric numbers given the motion.
-        cross: X, which relates errors of electric numbers to errors of the motion.
+        is_electric: mask of the electric parameters.
+        motion: M, information about the motion parameters.
+        own: O, information about the electric parameters given the motion.
+        cross: X, cross information that relates errors of electric and of motion parameters.
     """
 
     is_electric: Bool[np.ndarray, " free"]
@@ -64,7 +64,7 @@ class Information:
     cross: Float[np.ndarray, "electric motion"]
 
     def plus(self, rows: RunJacobians, times: float = 1.0) -> "Information":
-        """Return the information with these runs added `times` times; -1 removes them."""
+        """Return the information after adding these runs `times` times; -1 removes the runs."""
         # reshape(-1, ...) would fail for arrays without columns
         j, e, c = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in rows)
         return Information(
@@ -76,7 +76,7 @@ class Information:
 
     @cached_property
     def of_motion(self) -> Float[np.ndarray, "motion motion"]:
-        """Covariance of the numbers of the motion."""
+        """Covariance of the motion parameters."""
         return _inverse(self.motion)
 
     @cached_property
@@ -99,8 +99,8 @@ class Information:
     ) -> Float[np.ndarray, " run"]:
         """Return the criterion after one more run, for every candidate.
 
-        By Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W with W = J M^-1, the
-        inverted matrix is as large as the residuals of one run, not as the vector of all numbers.
+        With Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W, W = J M^-1, the
+        inverted matrix has one row per residual of a run instead of one per parameter.
         """
         of_motion, of_electric = goal[:, ~self.is_electric], goal[:, self.is_electric]
         rest: np.ndarray | float = 0.0
@@ -122,7 +122,7 @@ class Information:
 def information_of(
     covariance: Float[np.ndarray, "free free"], is_electric: Bool[np.ndarray, " free"]
 ) -> Information:
-    """Return the information that corresponds to a given covariance of all numbers."""
+    """Return the information that corresponds to a given covariance of all parameters."""
     e, m = np.flatnonzero(is_electric), np.flatnonzero(~is_electric)
     of_motion = covariance[np.ix_(m, m)]
     motion = _inverse(of_motion)
@@ -138,14 +138,14 @@ def criterion_path(
     order: Sequence[int] | np.ndarray,
     at: Sequence[int] | None = None,
 ) -> list[float]:
-    """Return the criterion as runs are added in a given order.
+    """Return the values of the criterion as runs are added in a given order.
 
     Args:
         start: information before the first run.
         rows: Jacobians of the runs.
         goal: matrix G of the criterion.
         order: indices of the runs.
-        at: counts of runs for which the criterion is returned; by default none, one, two, ... all.
+        at: numbers of added runs at which the criterion is returned; by default 0, 1, 2, ... all.
     """
     counts = range(len(order) + 1) if at is None else at
     found, now, done = [], start, 0
@@ -158,9 +158,9 @@ def criterion_path(
 def greedy(
     start: Information, rows: RunJacobians, goal: np.ndarray, most: int, target: float = 0.0
 ) -> tuple[list[int], list[float]]:
-    """Return at most `most` runs, each of which reduces the criterion most; runs may be repeated.
+    """Choose at most `most` runs one by one, each time the run that reduces the criterion most.
 
-    The choice stops once the criterion has fallen to the target.
+    A run may be chosen repeatedly. The choice stops once the criterion has fallen to the target.
 
     Returns:
         indices of the runs, and the criterion before the first and after each of them.
@@ -177,7 +177,7 @@ def greedy(
 def exchanged(
     start: Information, rows: RunJacobians, goal: np.ndarray, chosen: Sequence[int]
 ) -> list[int]:
-    """Return the runs after replacing each by the best candidate, the most useful run first."""
+    """Replace each chosen run by the best candidate, and return the runs, the most useful first."""
     kept = list(chosen)
     for k in range(len(kept)):
         others = start.plus(rows.pick(kept[:k] + kept[k + 1 :]))
@@ -194,6 +194,6 @@ def exchanged(
 
 
 def _inverse(a: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric positive matrix with entries of widely different size."""
+    """Invert a symmetric positive matrix, scaled to unit diagonal, as entries differ widely."""
     scale = 1 / np.sqrt(np.diag(a))
     return np.asarray(np.linalg.inv(a * scale[:, None] * scale) * scale[:, None] * scale)

@@ -18,7 +18,7 @@ from slipid.predict.open_loop import chain
 SESSION = "next"
 """Name of the session of new runs, for which the marker is mounted anew."""
 HEADINGS = tuple(15.0 * k for k in range(24))
-"""Headings of candidate runs and of predictions [deg]."""
+"""Default headings of candidate runs and of predictions [deg]."""
 BEND_RATIO = 0.5
 """Ratio of yaw rate times base radius to speed in curved candidate runs."""
 
@@ -48,7 +48,7 @@ class PlannedRun:
 
     @property
     def session(self) -> str:
-        """Name of the session, within which the marker is not remounted (`slipid.data.windows`)."""
+        """Name of the session of the run; within a session, the marker is not remounted."""
         return f"{self.surface}/{self.load}/{self.speed:.2f}"
 
     @property
@@ -70,7 +70,7 @@ def candidates(
     headings_deg: Sequence[float] = HEADINGS,
     turns: Sequence[float] | None = None,
 ) -> tuple[PlannedRun, ...]:
-    """Return candidate runs: straight and curved in every heading and speed, and on the spot.
+    """Return candidate runs: straight and curved in all headings and speeds, and on the spot.
 
     Args:
         setups: floors and load set-ups.
@@ -78,8 +78,8 @@ def candidates(
         distance: path length by floor [m].
         base_radius: distance of the wheels from the robot's centre [m].
         headings_deg: directions of travel [deg].
-        turns: yaw rates [rad/s]. By default they are zero and, in both senses, `BEND_RATIO` times
-            the speed over the base radius; turns on the spot have the speed over the base radius.
+        turns: yaw rates [rad/s]. By default, runs with a speed have zero and plus or minus
+            `BEND_RATIO` * speed / base radius; turns on the spot plus or minus speed / base radius.
     """
     out = []
     for surface, load in setups:
@@ -98,9 +98,9 @@ def candidates(
 def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[PlannedRun, ...]:
     """Return the 36 commands of the 2021 paper, each with every set-up before the next command.
 
-    They are along x and y at 100 to 400 mm/s, along the diagonals at 100 to 300 mm/s in both x and
-    y, and turns on the spot at 20 to 50 deg/s. Source: Belyaev, Brylev and Ivanov 2021, commands in
-    their logs.
+    The commands are straight runs along x and y at 100 to 400 mm/s and along the diagonals at 100
+    to 300 mm/s per axis, and turns on the spot at 20 to 50 deg/s. Source: Belyaev, Brylev and
+    Ivanov 2021, commands in their logs.
     """
     settings = [(a, v, 0.0) for v in (0.1, 0.2, 0.3, 0.4) for a in (0.0, 180.0, 90.0, 270.0)]
     settings += [(0.0, 0.0, s * rate) for rate in (20.0, 30.0, 40.0, 50.0) for s in (1, -1)]
@@ -147,8 +147,8 @@ def steady_windows(
     """Return noise-free windows of runs at steady wheel speeds, one segment per run.
 
     A run of any length is one segment, as it has one run effect. Runs are centred in the image, and
-    the marker's heading is zero at their start. Currents have no ammeter noise, since it is not
-    known beforehand and averages out over a window.
+    the marker's heading is zero at the start of each run. Currents have no ammeter noise, since
+    this noise is not known beforehand and averages out over a window.
     """
     n, per_piece, motors = len(runs), channels.windows, robot.geometry.drives
     base, radius = float(robot.geometry.base_radius), float(robot.geometry.wheel_radius)

@@ -32,9 +32,9 @@ _RUNS_PER_CALL = 256
 class Planner:
     """Simulation of planned runs and their Fisher information, for a fit's robot and variances.
 
-    Planned runs belong to a new session. Its effects along, across and in yaw are further unknowns
-    on floors where sessions differ: vectors hold the numbers of the search space, followed by these
-    effects, in units of their std.
+    Planned runs belong to a new session. On floors where sessions differ, the effects of the new
+    session along, across and in yaw are further unknowns: a vector of unknowns is the search
+    vector, followed by these effects in units of their std.
     """
 
     def __init__(
@@ -63,7 +63,8 @@ class Planner:
         self._differ = np.array([any(map(self.variance.get, names)) for names in of_floor])
         self.effects = len(AXES) * int(self._differ.sum())
         self.is_electric = np.concatenate([electric, np.zeros(self.effects, bool)])
-        # shared effects of neighbouring runs are treated as effects of each run alone
+        # The planned runs have no shared effects: the variance of neighbours' effects is added to
+        # that of each run's individual effect.
         own = {f"run.{x}.{a}": f"neighbours.{x}.{a}" for x in robot.surfaces.labels for a in AXES}
         self._log_v = np.log(
             [
@@ -80,7 +81,7 @@ class Planner:
         return steady_windows(runs, self.robot, self.channels, session)
 
     def nothing(self) -> Information:
-        """Return the information of the prior alone; marker yaws of sessions are taken as known."""
+        """Return the information of the prior without runs; marker yaws of sessions are known."""
         single = self.space.where(lambda e: e.session is not None)
         std = np.where(single, 1e-6, self.space.prior_std)
         return self._known(np.diag(std**2))
@@ -88,7 +89,7 @@ class Planner:
     def after(self, fit: Fit) -> Information:
         """Return the information after a fit.
 
-        The marker yaws of its sessions are marginalised, as planned runs have a new session.
+        The marker yaws of the fit's sessions are marginalised, as planned runs have a new session.
         """
         place = {name: k for k, name in enumerate(fit.space.names)}
         mine = [k for k, name in enumerate(self.space.names) if name in place]
@@ -107,8 +108,7 @@ class Planner:
         return first.joined(*others)
 
     def _rows(self, runs: Sequence[PlannedRun]) -> RunJacobians:
-        # The runs are padded to a fixed number, so that the function is compiled for one shape
-        # only.
+        # The runs are padded to a fixed number, so that the Jacobian is compiled only once.
         filled = [*runs, *[runs[-1]] * (_RUNS_PER_CALL - len(runs))]
         windows = self._windows(filled)
         this = self._problem.of(windows)
@@ -117,7 +117,7 @@ class Planner:
         effect = effects(windows, self.robot) * std[:, None]
         on = np.eye(len(self._differ))[np.asarray(this.batch.surface)][:, self._differ]
         moved = (effect[:, :, None, :] * on[:, None, :, None]).reshape(*effect.shape[:2], -1)
-        # effects of the session change the motion only
+        # Session effects change the motion only: for currents and voltages their columns are zero.
         wider = ((0, 0), (0, 0), (0, self.effects))
         of_motion = jnp.concatenate([jacobian["motion"], -moved], axis=2)
         jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items()} | {"motion": of_motion}
@@ -132,9 +132,10 @@ class Planner:
         )
 
     def ends(self, runs: Sequence[PlannedRun]) -> Float[np.ndarray, "run 2 number"]:
-        """Return the derivative of each run's end point by the numbers, divided by its distance.
+        """Return the derivative of each run's end point with respect to the unknowns, per metre.
 
-        Effects and the marker yaw of a single session are not part of a prediction.
+        The derivative is divided by the distance of the run. Effects and marker yaws of single
+        sessions are not part of a prediction.
         """
         b = lk.batch(self._windows(runs, session=""), self.robot)
         jacobian = np.array(end_jacobian(self.space, self.z, b, np.zeros((len(runs), 3))))
@@ -149,7 +150,7 @@ class Goal:
     Attributes:
         name: name of the parameter or prediction.
         unit: unit of the std.
-        rows: the matrix G.
+        rows: the matrix G that maps changes of the unknowns to changes of the quantity.
         floors: floors on which runs inform directly about the goal, empty for any.
         loads: load set-ups with which runs inform directly about the goal, empty for any.
     """
@@ -161,12 +162,12 @@ class Goal:
     loads: frozenset[str] = frozenset()
 
     def is_about(self, setup: Setup) -> bool:
-        """Return True if runs on this floor with this load inform directly about the goal."""
+        """Return True if runs with this floor and load set-up inform directly about the goal."""
         floor, load = setup
         return floor in (self.floors or {floor}) and load in (self.loads or {load})
 
     def std(self, information: Information) -> float:
-        """Return the std of the goal with this information."""
+        """Return the std of the goal's quantity at this information."""
         return float(np.sqrt(max(information.criterion(self.rows), 0.0)))
 
 
@@ -188,7 +189,7 @@ def parameter_goal(planner: Planner, path: str) -> Goal:
 def prediction_goal(planner: Planner, name: str, runs: Sequence[PlannedRun]) -> Goal:
     """Return the goal to reduce the end-point errors of `runs` due to uncertain parameters.
 
-    Its std is their root mean square, divided by the distance.
+    The goal's std is the root mean square of these errors, each divided by the run's distance.
     """
     rows = planner.ends(runs)
     return Goal(
@@ -201,7 +202,11 @@ def prediction_goal(planner: Planner, name: str, runs: Sequence[PlannedRun]) -> 
 
 
 def weighed(goals: Sequence[Goal], now: Information, weight: Sequence[float]) -> np.ndarray:
-    """Return G of the weighted mean of (std_g / present std_g)^2 over goals g, which is 1 now."""
+    """Return the matrix G for which tr(G cov G^T) is the weighted mean of (std_g / s_g)^2.
+
+    The mean is over the goals g; s_g is the std of goal g at the information `now`, so that the
+    mean is 1 at present.
+    """
     share = np.asarray(weight, float) / np.sum(weight)
     parts = [np.sqrt(w) / g.std(now) * g.rows for g, w in zip(goals, share, strict=True)]
     return _compact(np.concatenate(parts))

@@ -1,4 +1,4 @@
-"""Proposal of the next runs that reduce given stds most, and comparison with grids of runs."""
+"""Proposal of the runs to drive next to reduce given stds most, compared with grids of runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 SCHEMA = "slipid.design/1"
 UNREACHABLE_RATIO = 0.9
-"""A goal is unreachable if unlimited driving leaves more than this ratio of its present std."""
+"""A goal is unreachable if unlimited driving leaves at least this fraction of its present std."""
 RANDOM_ORDERS = 8
 """Number of random orders of a grid's runs over which the criterion is averaged."""
 CURVE_POINTS = 40
-"""Number of counts of runs at which the criterion of a grid is computed."""
+"""Number of points on the curve of a grid's criterion over the number of its runs."""
 ASSUMPTIONS = (
     "noise and run effects are those of the fit, and each run is one observation, whatever its "
     "length",
@@ -44,8 +44,8 @@ class Design:
     """Proposed runs, the most useful first; `print` shows their commands as CSV.
 
     Attributes:
-        content: content of design.json, with expected stds after each run, and the numbers of runs
-            saved compared with grids.
+        content: content of design.json, which includes the stds expected after each run, and how
+            many runs are saved compared with grids.
         runs: the proposed runs.
         base_radius: distance of the wheels from the robot's centre [m].
         validity: ranges that the runs of the fit cover, by floor.
@@ -63,7 +63,7 @@ class Design:
         return "\n".join([commands(self).rstrip(), *notes])
 
     def plot(self) -> "Figure":
-        """Draw the runs, and the uncertainty over the number of runs."""
+        """Draw the runs, and the expected uncertainty as a function of their number."""
         from slipid.plots.design import design_figure
 
         return design_figure(self)
@@ -140,7 +140,7 @@ def design(scope: Scope) -> Design:
 
 
 def _goals(scope: Scope, planner: Planner) -> dict[Goal, float]:
-    """Return the requested goals, or predictions and weakly identified numbers, with weights."""
+    """Return the requested goals with weights, by default predictions and weak parameters."""
     found = [parameter_goal(planner, path) for path in _paths(scope.fit, scope.parameters)]
     found += [
         prediction_goal(planner, f"prediction {text}", scope.predicted(text))
@@ -175,20 +175,22 @@ def _out_of_reach(
     fit: Fit, goal: Goal, now: info.Information, last: info.Information, count: int
 ) -> str | None:
     """Return the reason why no candidate reduces a goal's std, None if one does."""
-    # without voltages, the scale of these numbers comes from priors of other numbers only
+    # Without voltages, the scale of parameters in `NEEDS_VOLTAGE` comes only from priors of other
+    # parameters: driving does not reduce their stds, whatever the linear model predicts.
     scaleless = goal.name in NEEDS_VOLTAGE and not fit.channels.voltage
     part = goal.std(last) / goal.std(now)
     if part < UNREACHABLE_RATIO and not scaleless:
         return None
     most = (
-        f"driving all {count} {info.UNLIMITED_REPEATS:.0f} times would leave {part:.0%} of its std"
+        f"driving all {count} candidates {info.UNLIMITED_REPEATS:.0f} times would leave {part:.0%} "
+        "of its std"
     )
     why = next((f.text for f in fit.flat if goal.name in f.paths), most)
     return f"no candidate run reduces the std of {goal.name}: {why}"
 
 
 def _extrapolated(fit: Fit, runs: Sequence[PlannedRun]) -> list[str]:
-    """Return warnings about proposed runs outside the fitted ranges (untested for the model)."""
+    """Return warnings about proposed runs outside the ranges of the fitted runs."""
     out = []
     for floor, valid in fit.validity.items():
         mine = [d for d in runs if d.surface == floor]
@@ -216,10 +218,10 @@ def _saved(
     candidates: Sequence[PlannedRun],
     rows: info.RunJacobians,
 ) -> Content:
-    """Return the numbers of greedily chosen runs that reach the criterion of whole grids of runs.
+    """Return, for each grid, how many greedily chosen runs reach the criterion of the whole grid.
 
-    Both begin without data. The runs are chosen among the candidates and the grid's own runs. The
-    grids cover the floors and load set-ups of the fit that the goals depend on.
+    The grid and the greedy choice both start without data. The choice is among the candidates and
+    the grid's runs. The grids cover the fit's floors and load set-ups that inform about the goals.
     """
     setups = [s for s in scope.setups if any(g.is_about(s) for g in goals)]
     setups = [s for s in setups if s in scope.driven] or setups or list(scope.setups)

@@ -29,15 +29,15 @@ def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """Goals and candidate runs of a proposal, by the options of `slipid design`.
+    """Goals and candidate runs of a proposal, according to the options of `slipid design`.
 
-    The default of each option is the range covered by the fitted runs. A goal is a parameter or a
+    By default, candidates cover the ranges of the fitted runs. A goal is a parameter or a
     prediction whose std is to be reduced by the new runs.
 
     Attributes:
         fit: the fit.
-        parameters: patterns of the names of goals.
-        predictions: goals of the form `floor[@load][:speed[:heading_deg]]`.
+        parameters: patterns of parameter names; every matching parameter is a goal.
+        predictions: predictions that are goals, as `floor[@load][:speed[:heading_deg]]`.
         runs: number of runs to propose.
         headings: headings of candidates, numbers with commas [deg].
         speeds: speeds of candidates, numbers with commas [m/s].
@@ -47,7 +47,8 @@ class Scope:
         loads: load set-ups of candidates.
 
     Raises:
-        DataError: the fit lacks a floor or load, a list has no numbers, or no run is drivable.
+        DataError: the fit lacks a requested floor or load set-up, an option is invalid, or no run
+            is drivable.
     """
 
     fit: Fit
@@ -75,12 +76,12 @@ class Scope:
 
     @property
     def driven(self) -> tuple[Setup, ...]:
-        """Floors and loads of the fit's runs."""
+        """Pairs of floor and load set-up of the fit's runs."""
         return tuple((floor, load) for floor, v in self.fit.validity.items() for load in v.loads)
 
     @property
     def setups(self) -> tuple[Setup, ...]:
-        """Floors and loads of candidates."""
+        """Pairs of floor and load set-up of candidates."""
         floors = self.floors or tuple(self.fit.validity)
         loads = self.loads or self.fit.robot.body.loads
         return tuple((floor, load) for floor in floors for load in loads)
@@ -93,7 +94,7 @@ class Scope:
     def driven_speeds(self) -> dict[str, tuple[float, ...]]:
         """Up to `MOST_SPEEDS` speeds of each floor's runs [m/s].
 
-        If none is known, they are half and all of the largest rim speed.
+        On a floor without known speeds of runs, they are half and all of the largest rim speed.
         """
         out = {}
         for floor, valid in self.fit.validity.items():
@@ -107,7 +108,7 @@ class Scope:
 
     @property
     def distance(self) -> dict[str, float]:
-        """Path length of each floor's candidates [m], by default the mean of its runs."""
+        """Path length of each floor's candidates [m], by default the mean over the floor's runs."""
         if self.length is not None:
             return dict.fromkeys(self.fit.validity, self.length)
         return {floor: round(v.distance, 2) for floor, v in self.fit.validity.items()}
@@ -148,11 +149,19 @@ class Scope:
         loads = self.fit.validity[floor].loads
         load = load or ("as_built" if "as_built" in loads else loads[0])
         runs = self._straight([(floor, load)], numbers[:1], numbers[1:] or HEADINGS)
-        return self._drivable(runs, f"--predict {text}: these wheels cannot drive in that heading")
+        return self._drivable(
+            runs,
+            f"--predict {text}: the wheels cannot drive straight in this heading; expected another "
+            "heading",
+        )
 
     def all_predicted(self) -> tuple[PlannedRun, ...]:
         runs = self._straight(self.driven, [], HEADINGS)
-        return self._drivable(runs, "predictions: these wheels cannot drive in that heading")
+        return self._drivable(
+            runs,
+            "the wheels cannot drive straight in any heading, so that there is no prediction to "
+            "improve; name goals with --parameter",
+        )
 
     def _straight(
         self, setups: Sequence[Setup], speeds: Sequence[float], headings_deg: Sequence[float]

@@ -2,16 +2,17 @@
 
 Each floor has separate load biases (`slipid.model.contact_law`). Their prior is estimated from all
 floors and keeps them near zero; the intervals of the loads take this prior into account. The test
-for disagreement removes it. With L the precision of the fit, P0 the part of L from this prior, and
-P1 the precision of an uninformative prior, the search vector z, relative to its prior mean, changes
-by
+for disagreement replaces this prior by an uninformative one. With L the precision of the fit, P0
+the part of L from the prior, and P1 the precision of the uninformative prior, the search vector z,
+relative to its prior mean, changes by
 
     d = (L + P1 - P0)^-1 (P0 - P1) z
 
 and the difference of two floors' biases, squared and divided by its covariance, is a chi-square
-variable if the contact law holds for both.
+variable if the contact law holds on both floors.
 
-A fit is trusted if it converged, predicts its runs, and has physically plausible numbers.
+A fit is trusted if it converged, predicts runs about as well as encoders or better, and has
+physically plausible parameters.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -38,9 +39,8 @@ _UNINFORMATIVE_STD = 1.0
 def disputes(space: Space, z: Search, covariance: Square) -> dict[tuple[str, str], float]:
     """Return pairs of floors whose load biases differ by more than noise, the largest first.
 
-    Their values are the differences of their load estimates [standard error].
-
-    The prior of the biases in `space` must have the fitted std (`Space.with_pooled`).
+    The value of a pair is the number of standard errors with the same p-value. The prior of the
+    biases in `space` must have the fitted std (`Space.with_pooled`).
     """
     bias = {e.surface: space.slices[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
@@ -67,7 +67,7 @@ def disputes(space: Space, z: Search, covariance: Square) -> dict[tuple[str, str
 def marked(
     numbers: Mapping[str, Estimate], found: Mapping[tuple[str, str], float]
 ) -> dict[str, Estimate]:
-    """Return the numbers; identified load shares have the verdict `disputed` if floors disagree."""
+    """Change `identified` to `disputed` in the verdicts of load fractions if floors disagree."""
     return {
         path: replace(e, verdict="disputed")
         if found and path.startswith("robot.load_share@") and e.verdict == "identified"
@@ -82,11 +82,12 @@ DOUBTFUL_RATIO, UNTRUSTED_RATIO = 1.1, 1.5
 """Ratios of the error of the model to that of the encoders above which a fit is doubtful, or not to
 be trusted."""
 SMALL_ERROR = 0.005
-"""Difference of the end-point errors of model and encoders, over path length, that is ignored."""
+"""Largest excess of the model's end-point error over the encoders', over path length, that is
+ignored."""
 USELESS_ERROR = 0.5
 """End-point error over path length above which a model is useless."""
 MANY_AT_BOUNDS = 3
-"""Smallest count of numbers at their bounds for which a fit is not to be trusted."""
+"""Smallest number of parameters at their bounds for which a fit is not to be trusted."""
 PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "motor.resistance": (1e-3, 1e3),
     "motor.back_emf": (1e-4, 10.0),
@@ -96,7 +97,7 @@ PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "robot.wheel_radius": (2e-3, 2.0),
     "robot.base_radius": (5e-3, 10.0),
 }
-"""Physically plausible ranges of the numbers of wheeled robots, in SI units."""
+"""Physically plausible ranges of the parameters of wheeled robots, in SI units."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class Trust:
     Attributes:
         word: level of trust.
         reasons: reasons against the fit, one sentence each.
-        floors: errors by floor.
+        floors: errors, keyed by floor.
         runs: number of predicted runs.
     """
 
@@ -138,7 +139,7 @@ class Trust:
 
     @property
     def warning(self) -> str | None:
-        """Warning that every picture of an unusable fit shows, or None."""
+        """Warning that every figure of an unusable fit shows; None for a usable fit."""
         return f"THIS FIT IS {self.word.upper()}" if self.is_bad else None
 
     def to_json(self) -> Content:
@@ -160,12 +161,12 @@ def verdict_of_trust(
     parameters: Iterable[Estimate],
     runs: int = 0,
 ) -> Trust:
-    """Return the trust in a fit, by its worst aspect: errors, convergence or fitted numbers.
+    """Return the trust in a fit, by its worst aspect: errors, convergence or parameters.
 
     Args:
-        floors: errors by floor, of held-out runs if there are any.
+        floors: errors, keyed by floor, of held-out runs if there are any.
         converged: True if the fit converged.
-        parameters: every number of the fit.
+        parameters: every parameter of the fit.
         runs: number of predicted runs.
     """
     numbers = list(parameters)
@@ -174,7 +175,7 @@ def verdict_of_trust(
         reasons.append((1, "the fit did not converge"))
     verdicts = {e.verdict for e in numbers} - {"fixed"}
     if verdicts and not verdicts & {"identified", "weak", "disputed"}:
-        reasons.append((1, "the logs determine none of its numbers"))
+        reasons.append((1, "the logs determine no parameter of the fit"))
     reasons.sort(key=lambda reason: -reason[0])
     level = max((level for level, _ in reasons), default=0)
     return Trust(WORDS[level], tuple(sentence for _, sentence in reasons), floors, runs)
@@ -183,18 +184,18 @@ def verdict_of_trust(
 def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
     """Yield reasons against a fit from its open-loop errors, floor by floor."""
     for name, e in floors.items():
-        both = f"{100 * e.model:.1f} % of the path, encoders alone by {100 * e.encoders:.1f} %"
+        both = f"{100 * e.model:.1f} % of the path, those of encoders by {100 * e.encoders:.1f} %"
         if not isfinite(e.model):
-            yield (2, f"on {name} its predictions are not finite numbers")
+            yield (2, f"on {name} the fit's predictions are not finite numbers")
         elif e.model > e.encoders + SMALL_ERROR and e.model > DOUBTFUL_RATIO * e.encoders:
             much = e.model > UNTRUSTED_RATIO * e.encoders and e.model > e.encoders + 4 * SMALL_ERROR
-            yield (2 if much else 1, f"on {name} its predictions are off by {both}")
+            yield (2 if much else 1, f"on {name} the fit's predictions are off by {both}")
         elif e.model > USELESS_ERROR:
-            yield (1, f"on {name} its predictions are off by {both}: neither is useful there")
+            yield (1, f"on {name} the fit's predictions are off by {both}: neither is useful there")
 
 
 def _of_numbers(numbers: list[Estimate]) -> Iterator[_Reason]:
-    """Yield reasons against a fit from numbers that are implausible or at their bounds."""
+    """Yield reasons against a fit from parameters that are implausible or at their bounds."""
     for e in numbers:
         for pattern, (low, high) in PLAUSIBLE.items():
             value = np.atleast_1d(np.asarray(e.value, float))

@@ -1,4 +1,4 @@
-"""Intervals and verdicts of every number and of ratios of numbers.
+"""Intervals and verdicts of every parameter and of ratios of parameters.
 
 Before a fit they are computed from the expected information, after it from the Laplace posterior.
 """
@@ -18,24 +18,25 @@ from slipid.search_space import Choice, Space
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior), in the search space, for `identified` and for `weak`."""
 FROM_ZERO = 3.0
-"""Smallest ratio of an identified positive number to its std.
+"""Smallest ratio of a positive parameter to its std at which it can be identified.
 
-The likelihood of a number closer to 0 is flat towards 0, even if its logarithm has a narrow
+The likelihood of a parameter closer to 0 is flat towards 0, even if its logarithm has a narrow
 interval."""
 AT_ZERO_STDS, AT_ZERO_RATIO = 4.0, 0.05
-"""Limits for a positive number that counts as being at its bound 0.
+"""Limits at which a positive parameter counts as being at its bound 0.
 
-It is more than `AT_ZERO_STDS` prior stds below its prior mean and less than `AT_ZERO_RATIO` times
-that mean. The second condition excludes numbers with a narrow prior that the data contradict.
+It must be more than `AT_ZERO_STDS` prior stds below its prior mean and less than `AT_ZERO_RATIO`
+times that mean. The second condition excludes parameters with a narrow prior that the data
+contradict.
 """
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
-"""Numbers that are not identified without voltages.
+"""Parameters that are not identified without voltages.
 
-Without voltages their scale is determined only by the priors of other numbers."""
+Without voltages their scale is determined only by the priors of other parameters."""
 Z95 = 1.6448536269514722
 """The 95 % quantile of a standard Gaussian."""
 LARGEST_LOG = 600.0
-"""Largest logarithm at an end of an interval; exp of larger ones would overflow."""
+"""Largest logarithm at an end of an interval; exp of a larger one could overflow."""
 
 
 def _ratio(unit: str, doc: str) -> Declaration:
@@ -44,19 +45,19 @@ def _ratio(unit: str, doc: str) -> Declaration:
 
 RATIOS: Mapping[tuple[str, str], Declaration] = {
     ("motor.resistance", "motor.back_emf"): _ratio(
-        "ohm*rad/(V*s)", "needs the voltage, as both do"
+        "ohm*rad/(V*s)", "needs logged voltages, as do the resistance and the back-EMF"
     ),
-    ("surface.friction", "motor.back_emf"): _ratio("rad/(V*s)", "the torque scale currents fix"),
+    ("surface.friction", "motor.back_emf"): _ratio("rad/(V*s)", "torque scale, from currents"),
     ("motor.coulomb_friction", "motor.back_emf"): _ratio("A", "current at crawling speed"),
     ("motor.viscous_friction", "motor.back_emf"): _ratio("A*s/rad", "current per wheel speed"),
     ("camera.scale", "robot.wheel_radius"): _ratio(
-        "1/m", "all that motion without slip determines"
+        "1/m", "the only ratio that motion without slip determines"
     ),
 }
-"""Quotients of a quantity and a number, which get a separate verdict if both are free.
+"""Pairs of numerator and denominator whose quotient gets its own verdict if both are free.
 
-A quotient may be identified even if neither number is. If the quantity has a value for each floor,
-there is a quotient for every floor.
+A quotient may be identified even if neither parameter is. If the numerator has a value for each
+floor, there is a quotient for every floor.
 
 The resistance occurs in the voltage equation only: contact forces determine the motion of the body,
 and with the torque constant they determine the currents. Without voltages not even R / C_e is
@@ -65,27 +66,27 @@ identified, in contrast to models that compute slip from R I^2 + C_e I wm."""
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """One fitted or fixed number (or short vector) with its uncertainty and verdict.
+    """One fitted or fixed parameter (or short vector) with its uncertainty and verdict.
 
     Attributes:
-        path: name of the number.
-        unit: unit of the number.
-        doc: meaning of the number.
-        labels: labels of a vector's entries, () for a scalar.
+        path: name of the parameter.
+        unit: unit of the parameter.
+        doc: meaning of the parameter.
+        labels: labels of a vector's elements, () for a scalar.
         value: a float, or one per label [unit].
-        std: a float, or one per label, None for a fixed number [unit].
+        std: a float, or one per label, None for a fixed parameter [unit].
         interval90: equal-tailed interval (low, high), or one such pair per label [unit].
         verdict: identified, weak, disputed, not_identified, at_bound or fixed; a vector has the
             verdict of its least determined direction.
         provenance: measured (determined by data), borrowed (by a prior or a default) or override
             (fixed by a choice: the user's, or slipid's if all runs have one speed).
         ratio: std(posterior) / std(prior) in the search space, the largest over the directions of a
-            vector, None for a fixed number.
-        pull: (estimate - prior mean) / std(prior), the largest in magnitude of a vector, None for a
-            fixed number.
-        prior_mean: mean of the prior, None for a fixed number [unit].
-        prior_std: std of the prior, None for a fixed number [unit].
-        source: `laplace` or `posterior`.
+            vector, None for a fixed parameter.
+        pull: (estimate - prior mean) / std(prior) in the search space, the largest in magnitude of
+            a vector, None for a fixed parameter.
+        prior_mean: mean of the prior, None for a fixed parameter [unit].
+        prior_std: std of the prior, None for a fixed parameter [unit].
+        source: origin of std and interval: `laplace` approximation or draws of the `posterior`.
     """
 
     path: str
@@ -112,15 +113,15 @@ def estimates(
     has_voltage: bool,
     flat: Collection[str],
 ) -> tuple[Estimate, ...]:
-    """Return every declared number with its interval and verdict, in order of declaration.
+    """Return every declared parameter with its interval and verdict, in order of declaration.
 
     Args:
-        space: free and fixed numbers.
+        space: free and fixed parameters.
         choices: user's choices.
         z: search vector of the estimate.
         covariance: covariance of the search vector.
         has_voltage: True if voltages were logged.
-        flat: paths of the numbers that change along flat directions.
+        flat: paths of the parameters that change along flat directions.
     """
     tree, out = space.tree(z), []
     for e in space.all:
@@ -164,14 +165,14 @@ def judged(
     The interval is that of the draws if there are any, else of the Gaussian approximation.
 
     Args:
-        base: path, unit, meaning and value of the number.
-        d: declaration, which has the map from the search space to SI units.
+        base: path, unit, meaning and value of the parameter.
+        d: declaration of the parameter, with the map from the search space to SI units.
         value: value [unit].
         mean: value in the search space.
         block: covariance in the search space.
         prior: mean and std of the prior in the search space.
-        forced: verdict that replaces the one by the ratio of stds, None for none.
-        is_flat: True if the number changes along a flat direction.
+        forced: verdict that replaces the one from the ratio of stds, None to replace nothing.
+        is_flat: True if the parameter changes along a flat direction.
         drawn: draws of a posterior in the search space.
     """
     prior_mean, prior_std = prior
@@ -221,13 +222,13 @@ def _at_bound(d: Declaration, value: np.ndarray, pull: np.ndarray, prior_std: np
 
 
 def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:
-    """Return the ratio of a positive number to its std, infinity for any other number."""
+    """Return the ratio of a positive parameter to its std, infinity for any other parameter."""
     positive = np.isfinite(declaration.lower) and not np.isfinite(declaration.upper)
     return float(1 / std_z.max()) if positive and not declaration.shares else np.inf
 
 
 def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
-    """Return the verdict for std(posterior) / std(prior) and a number's distance from 0 [std]."""
+    """Return the verdict for std(posterior) / std(prior) and the value's distance from 0 [std]."""
     if ratio < IDENTIFIED and from_zero >= FROM_ZERO:
         return "identified"
     return "weak" if ratio < WEAK else "not_identified"
@@ -236,17 +237,17 @@ def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
 def verdict_of(
     ratio: float, from_zero: float, forced: str | None, is_flat: bool
 ) -> tuple[str, str]:
-    """Return verdict and provenance of a number, after a fit or after sampling.
+    """Return verdict and provenance of a parameter, after a fit or after sampling.
 
-    At a ratio below 1/sqrt(2) the data have more information than the prior. A number that changes
-    along a flat direction is at most identified in a ratio with others: its scale, however narrow
-    its interval, is determined by another number's prior.
+    At a ratio below 1/sqrt(2) the data have more information than the prior. A parameter that
+    changes along a flat direction is at most weak and is borrowed: only its ratio to other
+    parameters can be identified, and its scale, however narrow its interval, comes from a prior.
 
     Args:
         ratio: std(posterior) / std(prior).
-        from_zero: distance of a positive number from 0 [std].
-        forced: verdict that replaces the one by `ratio`, None for none.
-        is_flat: True if the number changes along a flat direction.
+        from_zero: distance of a positive parameter from 0 [std].
+        forced: verdict that replaces the one from `ratio`, None to replace nothing.
+        is_flat: True if the parameter changes along a flat direction.
     """
     verdict = forced or by_ratio(ratio, from_zero)
     if is_flat and verdict == "identified":
@@ -264,10 +265,10 @@ def derived(
 ) -> tuple[Estimate, ...]:
     """Return the quotients `RATIOS` with intervals and verdicts.
 
-    The logarithm of a quotient is a difference of two coordinates. Its verdict follows from the
-    ratio of its posterior std, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to its prior std. With
-    draws of a posterior, of which z and the covariance are the mean and the covariance, intervals
-    are those of the draws.
+    The logarithm of a quotient is a difference of two coordinates. The verdict follows from the
+    ratio of the posterior std of this difference, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to
+    its prior std. With draws of a posterior, whose mean and covariance are then z and `covariance`,
+    intervals are those of the draws.
     """
     pairs = [
         (over.path, under, d)

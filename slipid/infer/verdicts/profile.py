@@ -1,13 +1,13 @@
-"""Profile likelihood of one number: the loss as a function of the number, the others refitted.
+"""Profile likelihood of one parameter: the loss as a function of it, all other parameters refitted.
 
-With f minus the log posterior, theta the number and eta all others,
+With f minus the log posterior, theta the parameter and eta all other parameters,
 
     F(theta) = min over eta of f(theta, eta),    D(theta) = F(theta) - F at its minimum
 
 D is half the squared distance from the estimate in stds if the Laplace approximation holds. The
-90 % interval of the likelihood is the range in which D, without the term of the number's own prior,
-is below chi2_1(0.9) / 2 = 1.353. A profile that remains level shows that the number is not
-identifiable.
+90 % interval of the likelihood is the range in which D, without the term of the parameter's own
+prior, is below chi2_1(0.9) / 2 = 1.353. A profile that remains level shows that the parameter is
+not identifiable.
 
 Source: Venzon and Moolgavkar 1988 (Applied Statistics 37(1)); Raue et al. 2009 (Bioinformatics
 25(15)).
@@ -35,31 +35,32 @@ if TYPE_CHECKING:
 RISE = float(chi2.ppf(0.9, 1)) / 2
 """Rise of minus log likelihood, above its minimum, at the ends of the 90 % interval."""
 _COMPLETE_RISE, _LARGEST_RISE = 1.5 * RISE, 3 * RISE
-"""Rise at which one side of a profile is complete, and largest rise of its last point: if it is
-exceeded and the point before lies within the interval, the last step is halved."""
+"""Rise at which one side of a profile is complete, and largest rise of its last point: if the last
+point exceeds it and the point before lies within the interval, the last step is halved."""
 _FARTHEST = 3.0
-"""Largest distance from the prior mean up to which a side is computed [prior std]."""
+"""A side is computed up to this distance from the prior mean [prior std] or from the estimate
+[Laplace std], whichever reaches farther."""
 _SHORTEST_STEP, _MOST_POINTS = 0.1, 24
 """Shortest step that is still halved [Laplace std], and largest number of points on a side."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Profile likelihood of one number; `print` shows its result in one sentence.
+    """Profile likelihood of one parameter; `print` shows its result in one sentence.
 
     Attributes:
-        path: name of the number.
-        unit: unit of the number.
-        value: values at which the number was fixed, in rising order [unit].
-        posterior: D at each value, with the number's own prior.
-        likelihood: D at each value without that prior, 0 at its minimum.
-        laplace: D at each value by the Laplace approximation, conditional on `given`.
+        path: name of the parameter.
+        unit: unit of the parameter.
+        value: values at which the parameter was fixed, in rising order [unit].
+        posterior: D at each value, with the parameter's own prior.
+        likelihood: D at each value without the parameter's own prior, 0 at its minimum.
+        laplace: D at each value in the Laplace approximation, conditional on `given`.
         estimate: value of the fit [unit].
         interval90: 90 % interval of the likelihood, None for the end of an open side [unit].
         ends: kind of each side: `closed`, `open` (the likelihood does not fall to the level of the
-            interval's end within the computed range) or `at_bound` (the same, but the number's
+            interval's end within the computed range) or `at_bound` (the same, but the parameter's
             bound ends the interval).
-        given: numbers that were fixed at the fit's values, as text; empty if all were refitted.
+        given: what was held at the fit's values, as text; empty if all parameters were refitted.
         settled: True if every refit converged.
         sentence: result in one sentence for people.
     """
@@ -81,24 +82,25 @@ class Profile:
         return self.sentence
 
     def plot(self) -> "Figure":
-        """Draw the rise of the loss over the values of the number."""
+        """Draw the rise of the loss over the values of the parameter."""
         from slipid.plots.posterior import profile_figure
 
         return profile_figure([self])
 
 
 def profiled(space: Space, path: str) -> Entry:
-    """Return the declared number of a path, which must be free and a scalar.
+    """Return the entry of the parameter `path`, which must be free and a scalar.
 
     Raises:
-        ValueError: the number does not exist, is fixed or a vector; the message lists the choices.
+        ValueError: the parameter does not exist, is fixed or a vector; the message lists valid
+            ones.
     """
     can = {e.path: e for e in space.free if e.size == 1}
     if path not in can:
         why = {e.path: f"{path} is fixed" for e in space.all}
-        why |= {e.path: f"{path} has {e.size} numbers" for e in space.free}
+        why |= {e.path: f"{path} is a vector of {e.size} numbers" for e in space.free}
         reason = why.get(path, f"no parameter '{path}'")
-        raise ValueError(f"{reason}; expected one free number: {', '.join(can)}")
+        raise ValueError(f"{reason}; expected one of the free scalars {', '.join(can)}")
     return can[path]
 
 
@@ -108,12 +110,12 @@ def profile(
     path: str,
     progress: Callable[[int, float], None] = lambda points, rise: None,
 ) -> Profile:
-    """Return the profile of a number around a fit, all other numbers refitted at each point.
+    """Return the profile of a parameter around a fit, all other parameters refitted at each point.
 
-    The variances are those of the fit. Where currents were logged, an electric number is profiled
-    with the motion as fitted, and a number of the motion with the likelihood of motion data only;
-    so is the Laplace approximation that is returned for comparison. `progress` is called after
-    every point with the count of points and the rise there.
+    The variances are those of the fit. Where currents were logged, an electric parameter is
+    profiled with the motion as fitted, and a motion parameter with the likelihood of motion data
+    only. The Laplace approximation in the result, for comparison, is made in the same way.
+    `progress` is called after every point with the number of points so far and the rise there.
     """
     entry = profiled(problem.space, path)
     at = problem.space.slices[path].start
@@ -155,7 +157,7 @@ def profile(
 
 
 class _Refits:
-    """Refits along one coordinate, each started at the result of its neighbour."""
+    """Refits along one coordinate, each started at the result of the neighbouring point."""
 
     def __init__(
         self, problem: Problem, optimum: Optimum, at: int, progress: Callable[[int, float], None]
@@ -168,7 +170,9 @@ class _Refits:
             self.of_motion = not electric[at]
             mine = electric == electric[at]
             self.free = mine.astype(float)
-            if not self.of_motion:  # given the motion: a block of the information
+            if not self.of_motion:
+                # The covariance with the motion held is the inverse of the electric block of the
+                # information.
                 held = np.where(mine[:, None] & mine, np.linalg.inv(covariance), np.eye(len(mine)))
                 covariance = np.linalg.inv(held)
         self.free[at] = 0.0
@@ -179,7 +183,7 @@ class _Refits:
         self.lowest = self.loss(optimum.state)
 
     def loss(self, state: FitState) -> float:
-        """Return minus the log posterior at fixed noise; without currents for a motion number."""
+        """Return minus the log posterior at fixed noise, without currents if `of_motion`."""
         problem, log_v = self.problem, state.log_variance
         blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
         if self.of_motion:
@@ -193,8 +197,8 @@ class _Refits:
     def side(self, sign: float) -> list[tuple[float, float]]:
         """Return points (coordinate, loss) from the estimate outward, downward for sign -1.
 
-        A side ends where the loss has risen by `_COMPLETE_RISE`, or `_FARTHEST` from the prior
-        mean.
+        A side ends where the loss without the parameter's own prior has risen by `_COMPLETE_RISE`,
+        or at the distance `_FARTHEST`.
         """
         points: list[tuple[float, float]] = []
         state, step, before = self.state, 0.5 * self.std, 0.0
@@ -261,7 +265,7 @@ def _sentence(
     if entry.path in NEEDS_VOLTAGE and not has_voltage:
         return (
             f"{entry.path}: no voltage is logged, so its limits come from the priors of other "
-            "numbers"
+            "parameters"
         )
     if low is None or high is None:
         side = f"below {high}" if low is None else f"above {low}"

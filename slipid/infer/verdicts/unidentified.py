@@ -1,13 +1,14 @@
 """Flat directions of the parameter space, with formulas and remedies as texts for people.
 
-In coordinates scaled by the prior stds S, the information P = S C^-1 S of prior and data has the
-eigenvalue 1 where the data are uninformative (C: covariance of the fit). A direction u is flat if
-u^T P u < 1 / 0.8^2: a step of one prior std along it hardly changes the likelihood, even if all
-other numbers are known. The result is a sparse basis of the flat directions, so that each changes
-few numbers; it is found by leaving out numbers one by one.
+In coordinates scaled by the prior stds S, the information of prior and data is P = S C^-1 S, where
+C is the covariance of the fit; P has the eigenvalue 1 in directions about which the data are
+uninformative. A unit direction u is flat if u^T P u < 1 / 0.8^2: the data then reduce the prior std
+along u by less than a fifth, even if all other directions are known. The result is a sparse basis
+of the flat directions, so that each direction changes few parameters; it is found by dropping
+parameters one by one.
 
-Where currents were logged, a direction of motion numbers only is judged by the information about
-the motion, as if the electric numbers were unknown.
+Where currents were logged, a direction that contains motion parameters only is judged by the
+information about the motion, with the electric parameters marginalised.
 """
 
 from collections.abc import Iterable, Mapping
@@ -36,7 +37,8 @@ _NO_EFFECT = 1.02
 
 Such directions are searched for first."""
 _NAMED_RATIO = 0.3
-"""Smallest prior-scaled step, or power, of a number named in a formula, relative to the largest."""
+"""Smallest prior-scaled step, or exponent, of a parameter that a formula contains, relative to the
+largest one."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +46,13 @@ class FlatDirection:
     """Direction of the parameter space along which the likelihood is flat.
 
     Attributes:
-        paths: names of the numbers that change.
-        powers: exponents p of the factors t^p for positive numbers, multiples of t [unit] for
-            unbounded ones; the largest is 1 or -1.
-        others: count of further numbers that change slightly.
+        paths: names of the parameters that change.
+        powers: change of each parameter with a variable t: exponent p of the factor t^p for a
+            positive parameter, multiple of t [unit] for an unbounded one; the one of largest
+            magnitude is 1.
+        others: number of further parameters that change slightly.
         formula: description of the direction in words.
-        remedy: channels to log or runs to drive that would determine the numbers.
+        remedy: channels to log or runs to drive that would determine the parameters.
     """
 
     paths: tuple[str, ...]
@@ -67,9 +70,9 @@ class _Precision:
     """Information P in prior-scaled coordinates.
 
     Attributes:
-        given: information P of all numbers.
-        electric: mask of the electric numbers, None without currents.
-        motion: information about the motion numbers with the electric ones marginalised.
+        given: information P about all parameters.
+        electric: mask of the electric parameters, None without currents.
+        motion: information about the motion parameters with the electric ones marginalised.
     """
 
     def __init__(self, given: Square, electric: np.ndarray | None = None):
@@ -80,7 +83,7 @@ class _Precision:
             self.motion[motion] = np.linalg.inv(np.linalg.inv(given)[motion])
 
     def of(self, picked: list[int]) -> Float[np.ndarray, "some some"]:
-        """Return the information on some coordinates, given the others."""
+        """Return the information about some coordinates, given all other ones."""
         of_motion = self.electric is not None and not self.electric[picked].any()
         return (self.motion if of_motion else self.given)[np.ix_(picked, picked)]
 
@@ -88,7 +91,7 @@ class _Precision:
         return float(u @ self.of(picked) @ u)
 
     def flattest(self, picked: list[int]) -> tuple[float, np.ndarray]:
-        """Return the smallest information along a unit vector of coordinates, and that vector."""
+        """Return the smallest information along a unit vector on `picked`, and that vector."""
         values, vectors = np.linalg.eigh(self.of(picked))
         return float(values[0]), vectors[:, 0]
 
@@ -103,12 +106,12 @@ def flat_directions(
 ) -> tuple[FlatDirection, ...]:
     """Return directions in which the data reduce the std of the prior by less than a fifth.
 
-    Numbers about which the data have no information come first, each by itself, since they would
-    otherwise be part of other directions. Marker yaws of single sessions and load biases of floors
-    are taken as known.
+    Flat single parameters come first, each as its own direction, since they would otherwise be part
+    of other directions. Marker yaws of single sessions and load biases of floors are taken as
+    known.
 
     Args:
-        space: free numbers and their priors.
+        space: free parameters and their priors.
         covariance: Laplace covariance of the search vector.
         has_current: True if currents were logged.
         has_voltage: True if voltages were logged.
@@ -143,12 +146,12 @@ def flat_directions(
 
 
 def members(found: Iterable[FlatDirection]) -> frozenset[str]:
-    """Return the paths of the numbers that change along flat directions."""
+    """Return the paths of the parameters that change along flat directions."""
     return frozenset(path for f in found for path in f.paths)
 
 
 def sentences(found: Iterable[FlatDirection]) -> tuple[str, ...]:
-    """Return a sentence per direction; single numbers with the same remedy share a sentence."""
+    """Return a sentence per direction; single parameters with the same remedy share a sentence."""
     alone: dict[str, list[str]] = {}
     together = []
     for f in found:
@@ -165,16 +168,16 @@ def _sparse(
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
     """Return a basis of the flat directions, as pairs of coordinates and a unit vector on them.
 
-    No coordinate of a direction can be left out without making it informative. After each direction
-    its largest coordinate (the first of equal ones) counts as known, as in Gaussian elimination, so
-    that directions are independent.
+    Without any one of its coordinates, a direction would no longer be flat. After each direction
+    the coordinate with its largest component (the first of equal ones) counts as known, as in
+    Gaussian elimination, so that directions are independent.
 
     Args:
         precision: the information.
         among: indices of the coordinates that are searched.
-        symmetry: indices of coordinates that a common factor may scale. This direction comes first
-            and complete if it is flat, since the search would only find parts of it.
-        move: prior-scaled step of each coordinate when its number is multiplied by a factor.
+        symmetry: indices of coordinates that a common factor may scale. The direction of this
+            scaling is tested as a whole before the search, which would only find parts of it.
+        move: prior-scaled step of each coordinate for a common factor on all parameters.
     """
     alone = [k for k in among if precision.of([k])[0, 0] < FLAT_INFORMATION]
     found = [([k], np.ones(1)) for k in alone]
@@ -201,7 +204,10 @@ def _sparse(
 def _without_one(
     precision: _Precision, picked: list[int], u: np.ndarray, limit: float
 ) -> tuple[list[int], np.ndarray] | None:
-    """Return a flat direction with one coordinate less, None if there is none."""
+    """Return a direction with information below `limit` on all but one coordinate, or None.
+
+    The coordinate with the smallest component of `u` is dropped first.
+    """
     for drop in np.argsort(np.abs(u)):
         fewer = [k for j, k in enumerate(picked) if j != drop]
         if fewer:
@@ -214,12 +220,11 @@ def _without_one(
 def _named(
     precision: _Precision, axes: list[Axis], picked: list[int], u: np.ndarray, std: np.ndarray
 ) -> np.ndarray:
-    """Return a mask of the numbers of a direction that its formula names.
+    """Return a mask of the coordinates of a direction that its formula contains.
 
-    These are the numbers with large prior-scaled steps (`_NAMED_RATIO`). If the data have no
-    information along the direction, numbers with large powers are named as well: a number with a
-    wide prior has a small prior-scaled step even if its scale is as uncertain as that of the
-    others.
+    These are the coordinates with large prior-scaled steps (`_NAMED_RATIO`). If the data have no
+    information along the direction, coordinates with large exponents are included as well: with a
+    wide prior, the prior-scaled step is small even if the exponent is as large as all others.
     """
     main = np.abs(u) >= _NAMED_RATIO * np.abs(u).max()
     if precision.along(picked, u) < _NO_EFFECT and len({axis.is_log for axis in axes}) == 1:
@@ -231,10 +236,11 @@ def _named(
 def _rounded(
     precision: _Precision, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
 ) -> np.ndarray:
-    """Return the step along a direction; powers of named numbers are rounded to multiples of 1/2.
+    """Return the search-space step along a direction, of length 1 in prior stds, rounded.
 
-    They are not rounded if the rounded direction is not flat. The step has unit length in prior
-    stds.
+    The steps of the coordinates in `main` are rounded to multiples of half the largest one, which
+    makes the exponents of a formula simple. They stay as they are if rounding would make one of
+    them zero, or the direction no longer flat.
     """
     step = u * std
     top = float(np.abs(step[main]).max())

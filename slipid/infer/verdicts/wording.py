@@ -10,22 +10,22 @@ from slipid.model.robot import Validity
 from slipid.parameter import Entry
 
 _LARGEST_POWER_RATIO = 10.0
-"""Product formulas with a larger ratio of powers are not used, as they would be hard to read."""
+"""Largest ratio of exponents in a product formula; a larger one would be hard to read."""
 _POWER_TOLERANCE = 0.05
-"""Difference below which two powers count as equal."""
+"""Difference below which two exponents count as equal."""
 
-NOTHING = "the data hardly determine "
-OTHERS_CHANGE = ", while others change slightly"
+NOTHING = "the data have almost no information about "
+OTHERS_CHANGE = ", while other parameters change slightly"
 
 
 class Axis(NamedTuple):
     """One coordinate of the search space.
 
     Attributes:
-        entry: number that the coordinate belongs to.
-        label: name for people.
+        entry: parameter that the coordinate belongs to.
+        label: name of the coordinate in texts.
         unit: unit of a step along the coordinate.
-        is_log: True if a step along the coordinate multiplies the number by a factor.
+        is_log: True if a step along the coordinate multiplies the parameter by a factor.
     """
 
     entry: Entry
@@ -35,7 +35,7 @@ class Axis(NamedTuple):
 
 
 def axes_of(entry: Entry) -> list[Axis]:
-    """Return the coordinates of a free number; those of load shares are log ratios."""
+    """Return the coordinates of a free parameter; those of load fractions are log ratios."""
     d = entry.declaration
     unit = "log-odds" if np.isfinite(d.upper) else d.unit
     is_log = bool(np.isfinite(d.lower) and not np.isfinite(d.upper))
@@ -55,8 +55,8 @@ def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
 
     Args:
         axes: the coordinates that change.
-        power: their powers or multiples, relative to the largest one.
-        step: their changes for a step of one prior std along the direction.
+        power: exponents or multiples of the coordinates, relative to the largest one.
+        step: changes of the coordinates for a step of one prior std along the direction.
     """
     names = [axis.label for axis in axes]
     if len(axes) == 1:
@@ -78,14 +78,16 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
     names = [axis.label for axis in axes]
     if (np.abs(power - 1) < _POWER_TOLERANCE).all():
         short = [axis.label for axis in axes if axis.entry.quantity != "surface.friction"]
-        if len(axes) - len(short) > 1:  # one pattern for the frictions of several floors
+        if len(axes) - len(short) > 1:
+            # A pattern keeps the sentence short where the frictions of several floors change.
             short.append("surface.*.friction")
         else:
             short = names
         last = NEEDS_VOLTAGE[1] if NEEDS_VOLTAGE[1] in short else short[0]
         return f"{', '.join(short)} only as {', '.join(f'{p}/{last}' for p in short if p != last)}"
     if len(names) == 2:
-        first, other, k = _pair(names, power)  # other / first^k does not change
+        # The formula is the quantity that stays constant along the direction: other / first^k.
+        first, other, k = _pair(names, power)
         held = _power(first, abs(k))
         held = f"{held} * {other}" if k < 0 else f"{other} / {held}"
         return f"{names[0]} and {names[1]} only as {held}"
@@ -97,7 +99,7 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
 
 
 def _pair(names: list[str], power: np.ndarray) -> tuple[str, str, float]:
-    """Return two names, and k, the power of the second over that of the first.
+    """Return two names, and the exponent k of the second relative to that of the first.
 
     The names are ordered so that |k| >= 1.
     """
@@ -113,7 +115,8 @@ def _sum(names: list[str], weight: np.ndarray) -> str:
     if (np.abs(weight - 1) < _POWER_TOLERANCE).all():
         return f"{', '.join(names)} only as their differences"
     if len(names) == 2:
-        first, other, k = _pair(names, weight)  # other - k first does not change
+        # The formula is the quantity that stays constant along the direction: other - k first.
+        first, other, k = _pair(names, weight)
         times = "" if abs(abs(k) - 1) < _POWER_TOLERANCE else f"{abs(k):.2g} "
         sign = "+" if k < 0 else "-"
         return f"{names[0]} and {names[1]} only as {other} {sign} {times}{first}"
@@ -128,7 +131,7 @@ _FLOOR = "surface"
 _CAMERA = (
     (
         ("camera.scale", "robot.wheel_radius"),
-        "measure the wheel radius, or a length in the camera's picture: more runs cannot help",
+        "measure the wheel radius, or a length in the camera's image: more runs cannot help",
     ),
     (
         ("camera.marker_yaw", "robot.drive_offset"),
@@ -140,10 +143,10 @@ _CAMERA = (
     (("camera.marker_place",), "turn on the spot in view of the camera"),
     (("camera.lag",), "start, stop and change speed in view of the camera"),
     *(
-        ((f"camera.{name}",), "drive across the whole picture, including its corners")
+        ((f"camera.{name}",), "drive across the whole camera image, including its corners")
         for name in ("tilt", "radial", "tangential")
     ),
-    (("camera.scale",), "measure a length in the camera's picture"),
+    (("camera.scale",), "measure a length in the camera's image"),
     (("robot.wheel_radius",), "measure the wheel radius"),
 )
 """Remedies for flat directions: the first whose quantities all occur in the direction is used.
@@ -155,7 +158,7 @@ FEW_HEADINGS = 4
 TURNING = 0.05
 """Yaw rate by the encoders above which a run counts as a curve [rad/s]."""
 LITTLE_SLIP = 0.03
-"""Slip below which the parameters of a floor hardly affect the motion."""
+"""Slip below which the parameters of a floor have little effect on the motion."""
 SPEEDS_DIFFER = 1.3
 """Ratio of two speeds above which they count as different."""
 
@@ -167,10 +170,10 @@ def remedy(
     validity: Mapping[str, Validity],
     sideways: bool = True,
 ) -> str:
-    """Return a sentence about logs or runs that would determine the numbers of a flat direction.
+    """Return a sentence on logs or runs that would determine the parameters of a flat direction.
 
     Args:
-        found: numbers of the direction.
+        found: parameters of the direction.
         has_current: True if currents were logged.
         has_voltage: True if voltages were logged.
         validity: ranges that the runs on each floor cover.
@@ -201,7 +204,7 @@ def _electric(
 
 
 def _runs(found: Sequence[Entry], validity: Mapping[str, Validity], sideways: bool) -> str:
-    """Return a sentence on further runs for numbers of floors, loads and marker."""
+    """Return a sentence on further runs for parameters of floors, loads and marker."""
     floors = {e.surface for e in found if e.surface is not None}
     loads = {e.load for e in found if e.load is not None}
     mine = [

@@ -55,7 +55,7 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
     for source in sources:
         try:
             each.append(tasks_of(options, source.name))
-        except Exception as error:  # A data set that cannot be read does not stop the others.
+        except Exception as error:  # the other data sets are compared even if one is unreadable
             unread[source.name] = FoldScore.of_error(error).absent
             report.line(f"skipped: {source.name}: {unread[source.name]}")
     folds = alternating(each)
@@ -91,7 +91,7 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
 
 
 def tasks_of(options: BenchmarkOptions, name: str) -> list[FoldTask]:
-    """Return one task for each fold of each kind of split of a source."""
+    """Return one task per fold, for all kinds of split of a source that the options request."""
     data = data_of(options, name)
     found = []
     for kind in data.source.kinds:
@@ -122,7 +122,7 @@ def _check(options: BenchmarkOptions) -> None:
     for name in options.only:
         if name not in every:
             raise DataError(
-                f"no row '{name}'{did_you_mean(name, every)}; expected some of {', '.join(every)}"
+                f"no row '{name}'{did_you_mean(name, every)}; expected one of {', '.join(every)}"
             )
 
 

@@ -15,7 +15,7 @@ OWN_PREFIX = "slipid"
 
 
 def benchmark_pictures(found: Content) -> dict[str, bytes]:
-    """Draw a figure for every data set of benchmark.json; return PNG bytes, keyed by its name."""
+    """Draw a figure for each data set of benchmark.json; return PNG bytes by data set name."""
     made = {n: benchmark_figure(one, found["protocols"], n) for n, one in found["sets"].items()}
     return {name: drawing.png(figure) for name, figure in made.items() if figure is not None}
 

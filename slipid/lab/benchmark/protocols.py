@@ -70,7 +70,7 @@ class Split(NamedTuple):
 
 
 def base_of(floor: str) -> str:
-    """Return the name of a floor without a load set-up, which may follow after `@`."""
+    """Return a floor's name without the load set-up that may follow `@`."""
     return floor.partition("@")[0]
 
 
@@ -115,7 +115,7 @@ def sectors(facts: Sequence[FoldKey]) -> Labels:
 
 
 def floors(facts: Sequence[FoldKey]) -> Labels:
-    """Return folds of one floor each, with any load set-up."""
+    """Return one fold for each floor, with all load set-ups on it."""
     return np.unique([base_of(f.floor) for f in facts], return_inverse=True)[1]
 
 
@@ -154,9 +154,9 @@ def inner(runs: Sequence[Run], kind: str) -> Labels:
     The training runs are divided by the protocol's kind of split. The `INNER_FOLDS` largest parts
     are held out in turn and numbered from 0. All other runs are -1, or `INNER_FOLDS` if runs are
     assigned at random, and always remain training runs. If the training runs have fewer than two
-    parts of the kind, they are divided by headings. This is always so for sectors: every other
-    sector is already missing from the training runs, and without one more the gap would be three
-    times as wide as in the protocol.
+    parts of the kind, they are divided by headings. Sectors are always divided so: the training
+    runs are every other sector, which is one part, and if another sector were held out of them, the
+    gap would be three times as wide as in the protocol.
     """
     facts = [facts_of_run(run) for run in runs]
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):

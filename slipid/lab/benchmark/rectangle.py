@@ -57,7 +57,7 @@ class RectangleTask:
         self._failure.unlink(missing_ok=True)
         try:
             self._identify()
-        except Exception as error:  # A task that fails does not stop the others.
+        except Exception as error:  # the other tasks run even if this one fails
             write_json(self._failure, {"failed": FoldScore.of_error(error).absent})
         return self.name
 

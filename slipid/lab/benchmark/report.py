@@ -69,7 +69,7 @@ def methods(
     Args:
         rows: rows of a protocol; those without results are omitted.
         numbers: fields of `COLUMNS` that become columns.
-        costs: trailing entries of `COSTS` that become columns after these.
+        costs: trailing entries of `COSTS`, which become the last columns.
     """
     there = [(name, one) for name, one in rows.items() if one["endpoint_error"] is not None]
     body = [
@@ -102,7 +102,7 @@ def costs_of(row: Content) -> list[str]:
 
 
 def absent(rows: Content) -> list[str]:
-    """Return one line for each reason why rows are absent or did not converge, with the rows."""
+    """Return a line for each reason why rows are absent or unconverged, with the rows' names."""
     why: dict[str, list[str]] = {}
     for name, row in rows.items():
         if row["unconverged"]:
@@ -197,9 +197,10 @@ LEGEND = (
     "End point: distance between the predicted and the true end, over the chord or the path. "
     "Minus slipid's: the difference on the same runs, negative if the row is better. Length: of "
     "the chord or the path. Heading: at the end. Twist: root mean square in windows of half a "
-    "second. In 90 %: share of end points in the predicted 90 % region. Slip AUC: area under the "
-    "receiver operating characteristic of slip detection. Floor: share of the time in which the "
-    "true floor is the most probable one, or correctly none. Energy: error of the electric "
+    "second. In 90 %: percentage of end points in the predicted 90 % region. Slip AUC: area under "
+    "the receiver operating characteristic of slip detection. Floor: percentage of the time in "
+    'which the most probable floor is the true one, or is "unknown" on a floor without training '
+    "runs. Energy: error of the electric "
     "energy of a run. Numbers: fitted parameters. Fit, step: time of one fit, and to predict one "
     "step of a run."
 )
@@ -227,7 +228,7 @@ def page(found: Content, pictures: Mapping[str, bytes]) -> str:
 
     Args:
         found: content of benchmark.json.
-        pictures: PNG files by the name of their data set.
+        pictures: content of PNG files, keyed by the name of the data set that each shows.
     """
     parts = [
         "<!doctype html><html lang='en'><meta charset='utf-8'>",

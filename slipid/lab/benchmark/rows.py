@@ -42,7 +42,7 @@ ROWS = tuple(method.name for method in _every())
 
 
 def rows(spec: RobotSpec) -> list[SlipModel]:
-    """Return the unfitted methods for a robot, even those that need channels it may not log."""
+    """Return the unfitted methods for a robot, whether or not it logs the channels they need."""
     every = _every()
     if spec.determines_twist:
         every = [method for method in every if method.name not in KINEMATIC]

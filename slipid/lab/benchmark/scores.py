@@ -23,10 +23,11 @@ from slipid.predict.slip_model import (
 from slipid.support.content import Content
 
 SLIP_THRESHOLD = 0.2
-"""Difference of the body's twist from that of the rolling wheels, relative to the latter, above
-which a window counts as slipping."""
+"""A window counts as slipping if the body's twist differs from the twist of the rolling wheels by
+more than this fraction of the latter."""
 REST_SPEED = 0.02
-"""Largest norm of the rolling wheels' twist of windows not used for slip detection [m/s]."""
+"""Windows in which the twist of the rolling wheels has at most this norm are not used for slip
+detection [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ class FoldScore(Generic[Scored]):
         runs: scores of the held-out runs, or answers of a classifier of floors.
         absent: reason why there are no scores: a channel that is missing in these logs, or an
             error; empty if there are scores.
-        failed: True if that reason is an error.
+        failed: True if `absent` names an error.
         settings: settings selected by cross-validation, in words.
         numbers: number of fitted parameters.
         tune_s: time to select the settings [s].
@@ -177,7 +178,7 @@ class FoldScore(Generic[Scored]):
 
     @classmethod
     def lacking(cls, channels: Iterable[str]) -> "FoldScore":
-        """Return the empty result of a method that needs these channels, which were not logged."""
+        """Return the empty result of a method that needs `channels`, which were not logged."""
         words = {"twist": "wheels that drive sideways", "command": "a commanded twist"}
         named = [words.get(name, f"a {name}") for name in sorted(channels)]
         return cls(absent=f"needs {' and '.join(named)}")
@@ -191,8 +192,8 @@ class FoldScore(Generic[Scored]):
     def of_folds(cls, folds: Sequence["FoldScore[Scored]"]) -> "FoldScore[Scored]":
         """Return all scores of a method, with the medians of its costs, but without its settings.
 
-        A method that is absent in some fold is absent altogether, since it would be averaged over
-        other runs than the rest.
+        A method that is absent in one fold is absent altogether, since its mean over the remaining
+        folds could not be compared with the means of other methods over all runs.
         """
 
         def median(name: str) -> float:

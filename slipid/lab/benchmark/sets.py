@@ -110,10 +110,10 @@ class DataSet:
     Attributes:
         source: source of the logs.
         job: task of slipid's fit to the runs.
-        logged: the same runs with all logged channels, also those that slipid's fit does not use.
+        logged: the same runs with all logged channels, including those that slipid's fit ignores.
         facts: floor, heading and speed of each run, by which runs are split.
         crossing: runs from one floor to another, or None.
-        map: map of the floors of these runs, or None.
+        map: map of the floors of the runs in `crossing`, or None.
     """
 
     source: LogSource
@@ -129,7 +129,7 @@ class DataSet:
         return RobotSpec.of(Space(self.job.robot, self.job.choices).template)
 
     def thinned(self, most: int) -> "DataSet":
-        """Return a data set of at most `most` runs, evenly taken from every floor and speed."""
+        """Return a data set of at most `most` runs, taken evenly from all floors and speeds."""
         count = len(self.logged)
         if count <= most:
             return self
@@ -159,7 +159,7 @@ def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> Data
     """Read the runs of a source; recorded runs of the package are unpacked below `out`.
 
     Raises:
-        DataError: its files cannot be read.
+        DataError: the config or a log of the source cannot be read.
     """
     path = packaged_path(source.config)
     config = parsed(path, text_of(path))

@@ -41,9 +41,11 @@ STEPS_MULTIPLE = 16
 """The steps of a replay are padded to a multiple of this number, so that few shapes are compiled.
 """
 RUNS_PER_CALL = 32
-"""Number of runs in one call of an estimator; fewer are padded, so that one shape is compiled."""
+"""Number of runs in one call of an estimator. Smaller numbers are padded, so that the estimator is
+compiled for a single array size."""
 LONGEST_STEP_S = 0.25
-"""Longest step of an estimator [s]; longer steps are split, since it rejects those of 0.5 s."""
+"""Longest step given to an estimator [s]. Longer steps are split, since an estimator rejects steps
+of 0.5 s and more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,7 @@ class SlipidFit:
         contact: fitted force balance, which predicts runs.
         job: fit task of all runs of the data set.
         floors: indices of the fitted floors.
-        highest_speed: highest wheel speed in these runs [rad/s].
+        highest_speed: highest wheel speed in the fitted runs [rad/s].
         trend: trend of current residuals, see `slipid.infer.slip_curves.current_trend`.
         seconds: duration of the fit [s].
         converged: True if the fit converged.
@@ -206,7 +208,7 @@ def _estimator(
         several: True if a run may cross several floors.
     """
     whole = fit.deployed
-    # floors without training runs have no parameters
+    # omit floors without training runs, whose parameters were not fitted
     rows = fit.floors if only is None else (whole.labels.index(only),)
     robot = DeployedRobot.of(whole.record.on(rows), load)
     if floors.unseen_floors:

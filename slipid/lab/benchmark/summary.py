@@ -107,9 +107,8 @@ class Bootstrap:
         for k in range(len(names)):
             mine = np.flatnonzero(floor == k)
             kinds, of = np.unique(cluster[mine], return_inverse=True)
-            if (
-                len(kinds) < FEWEST_CLUSTERS
-            ):  # There are too few clusters to estimate their scatter.
+            # resample single runs if there are too few clusters to estimate their scatter
+            if len(kinds) < FEWEST_CLUSTERS:
                 kinds, of = mine, np.arange(len(mine))
             picked = rng.multinomial(len(kinds), np.full(len(kinds), 1 / len(kinds)), DRAWS)
             draws[1:, mine] = picked[:, of]
@@ -120,7 +119,7 @@ class Bootstrap:
         return np.nanmean([self.on(x, k) for k in range(len(self.names))], axis=0)
 
     def over_all(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
-        """Return the mean over all runs with equal weights of runs, in every draw."""
+        """Return the mean over all runs, whatever their floor, in every draw."""
         return np.asarray(self.draws @ x / np.maximum(self.draws.sum(axis=1), 1e-12))
 
     def on(self, x: Float[np.ndarray, " run"], floor: int) -> Float[np.ndarray, " draw"]:
@@ -132,7 +131,7 @@ class Bootstrap:
 
 
 def mean_interval(draws: Float[np.ndarray, " draw"]) -> MeanInterval:
-    """Return the value of the first draw, with the 90 % interval of the other draws."""
+    """Return the first draw (that of the original runs), with the 90 % interval of the others."""
     low, high = np.nanquantile(draws[1:], INTERVAL)
     return MeanInterval(float(draws[0]), float(low), float(high))
 
@@ -183,7 +182,7 @@ def _summary(
 def _auc(runs: Sequence[RunScore], by: Bootstrap) -> MeanInterval | None:
     """Return the area under the slip detection curve over all windows; None if it is undefined.
 
-    Its interval uses a fifth of the draws.
+    Its interval is computed from a fifth of the draws, to save time.
     """
     score = np.concatenate([run.scores for run in runs])
     slips = np.concatenate([np.asarray(run.slips, bool) for run in runs])
@@ -199,9 +198,9 @@ def area(
     positive: Bool[np.ndarray, " window"],
     weight: Float[np.ndarray, " window"],
 ) -> float:
-    """Return the weighted probability that a positive scores higher than a negative window.
+    """Return the weighted probability that a positive window scores higher than a negative one.
 
-    It equals the area under the receiver operating characteristic; ties count half.
+    This probability equals the area under the receiver operating characteristic; ties count half.
     """
     values, at = np.unique(score, return_inverse=True)
     up = np.bincount(at, weight * positive, len(values))

@@ -12,7 +12,7 @@ from slipid.predict.slip_model import TRIES, RobotSpec, Run, SlipModel
 from slipid.predict.slip_models import ByFloor
 
 LARGEST_ERROR = 2.0
-"""Upper limit of the relative error of a run in the loss; larger errors count as this."""
+"""Upper limit of a run's relative error in the loss; larger errors are replaced by this limit."""
 Method = TypeVar("Method")
 
 
@@ -34,7 +34,7 @@ class Tuned(Generic[Method]):
 
 
 def best_candidate(candidates: Sequence[Method], loss: Callable[[Method], float]) -> Tuned[Method]:
-    """Return the candidate with the smallest loss; the first of equally good ones."""
+    """Return the candidate with the smallest loss; the first such candidate if several tie."""
     if len(candidates) == 1:
         return Tuned(candidates[0])
     losses = [loss(candidate) for candidate in candidates]
@@ -46,9 +46,9 @@ def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) ->
     """Return the method with the best of its settings, unfitted.
 
     With each setting, the method is fitted without a part of the runs and scored on that part. The
-    part is chosen by the protocol's kind of split where the training runs allow it. The score is
-    the mean error, averaged with equal weights of floors: that of the end point relative to the
-    path length or that of the energy, see `SlipModel.aim`. A setting with which the method
+    part is chosen by the protocol's kind of split where the training runs allow it (`inner`). The
+    score is a mean error in which all floors have equal weights: the end-point error relative to
+    the path length, or the energy error, as `SlipModel.aim` says. A setting with which the method
     cannot be fitted has the worst score. All training runs are used, since settings that are best
     for fewer runs are too cautious. For a method that is fitted floor by floor, one fit to all runs
     together is also tried, with the best settings, and used if it has the smaller loss.

@@ -89,7 +89,7 @@ class FoldTask:
         if missing:
             try:
                 data: FoldData | FoldScore[RunScore] = fold_data(self)
-            except Exception as error:  # a task that fails does not stop the others
+            except Exception as error:  # all rows report the error, and other tasks still run
                 data = FoldScore.of_error(error)
             for protocol, name in missing:
                 score = data if isinstance(data, FoldScore) else _score(data, protocol, name)
@@ -104,7 +104,7 @@ class FoldTask:
 
 
 def source_of(name: str) -> LogSource:
-    """Return a source by its name."""
+    """Return the log source with this name."""
     return next(source for source in SOURCES if source.name == name)
 
 
@@ -128,7 +128,7 @@ def split_of(task: FoldTask) -> Split:
 
 
 def checkpoint_of(task: FoldTask, fit: bool) -> Checkpoint:
-    """Return the checkpoint of slipid's fit in a task if `fit`, else that of the task's scores."""
+    """Return a task's checkpoint of slipid's fit if `fit` is True, else that of its scores."""
     data = data_of(task.options, task.source)
     more = () if fit else (data.crossing_hash, source_hash(*ROW_SOURCES))
     split = split_of(task)
@@ -231,14 +231,14 @@ def _score(data: FoldData, protocol: str, name: str) -> FoldScore[RunScore]:
         if lacks := method.needs - has:
             return FoldScore.lacking(lacks)
         return _published(data, rules, runs, method)
-    except Exception as error:  # a row that fails does not stop the others
+    except Exception as error:  # the other rows are scored even if this one fails
         return FoldScore.of_error(error)
 
 
 def _published(
     data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], method: SlipModel
 ) -> FoldScore[RunScore]:
-    """Return the score of a published method: tuned, fitted and applied to the held-out runs."""
+    """Tune and fit a published method, and return its score on the held-out runs."""
     spec = data.data.spec
     training = [run.with_floor(protocol.floor_known) for run in data.training]
     began = time.perf_counter()

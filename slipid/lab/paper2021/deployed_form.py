@@ -4,6 +4,7 @@
 
     paper_print           s = -0.072 + 4.888 M - 5.456 M^2, clipped to [0, 1], as printed
     paper_code            1 - s = a_i I~ + b_i, s in [0, 1], where I~ > 0.4 A, else s = 0, as run
+                          on the authors' robot
     paper_print_refit     s = c0 + c1 M + c2 M^2, one curve for all motors
     paper_code_refit      s = c_i I~ + d_i where I~ > 0.4 A, else s = 0, for each motor
     paper_linear_svr      s = c0 + c1 M, by epsilon-insensitive regression, clipped to [0, 1]
@@ -26,7 +27,7 @@ Liberties:
       scripts, the refits those of the robot's config.
     - `paper_code` starts its smoothing at a run's first current. On robots that do not have three
       drives, each wheel has the mean of the slips by the three motors' lines.
-    - The refits are clipped to [-1, 1] instead: the slip of a dragged wheel is negative.
+    - The refits are clipped to [-1, 1] instead of [0, 1]: the slip of a dragged wheel is negative.
     - The recipe's M is not cut at 0.5 N m, and all motors are pooled, as the printed curve is used
       for all; at most 3000 samples are used.
     - C and epsilon are not printed. With our values, epsilon a tenth of a robust std, the line of
@@ -109,7 +110,7 @@ def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
     rim = signals.speed * spec.wheel_radius
     real = w.twist @ spec.forward.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        # a wheel at rest has no finite slip ratio: the comparisons below are false for it
+        # a wheel at rest has no finite slip ratio, so that the comparisons below omit its sample
         slip = 1.0 - real / rim
     amps = signals.along(spec)
     kept = (slip > 0.0) & (slip <= 1.0) & (amps > FIGURES_3_AND_4.min_current)

@@ -179,7 +179,7 @@ def _model(
 def _medians(
     axes: Axes, x: np.ndarray, slip: np.ndarray, colour: str, marker: str, label: str, width: float
 ) -> None:
-    """Draw the median slip of each bin of x that has at least 8 points; `width` is a bin's."""
+    """Draw the median slip in each bin of x, `width` wide, that has at least 8 points."""
     bins = np.floor(x / width).astype(int)
     filled = [b for b in np.unique(bins) if np.count_nonzero(bins == b) >= 8]
     centre = [np.median(x[bins == b]) for b in filled]

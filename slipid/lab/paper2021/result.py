@@ -22,8 +22,8 @@ class TrackFile:
         name: key in results.
         label: controller of the robot.
         square: <square> in the file name `square_<square>_camera.csv` in the folder figure7.
-        authors_frames: camera frames of the first side, by the index of the authors.
-        side_frames: camera frames of the first side in this file, up to the robot's turn.
+        authors_frames: number of camera frames on the first side, according to the authors' index.
+        side_frames: number of camera frames on the first side in this file, up to the robot's turn.
         printed_path_length: length of the first side printed in the paper [mm].
     """
 
@@ -129,7 +129,7 @@ class PaperResult:
 
     Attributes:
         field: samples and models of figure 2: motor 1 over the whole site.
-        motors: samples and models of figures 3 and 4 and their table, by motor number.
+        motors: samples and models of figures 3 and 4 and of their table, keyed by motor number.
         tracks: camera tracks of figure 7.
         transfer: transfer of slip curves between surfaces of the 2022 runs; None without these.
     """

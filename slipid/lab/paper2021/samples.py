@@ -125,7 +125,7 @@ def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Sl
     speed = table[f"Motor {motor} velocity, rpm"] * rpm
     current = table[f"Motor {motor} current, A"]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # a wheel at rest has no finite slip ratio: the comparisons below are false for it
+        # a wheel at rest has no finite slip ratio, so that the comparisons below omit its sample
         slip = 1.0 - effective[:, motor - 1] / speed
         voltage = recipe.back_emf * speed + recipe.resistance * current * np.sign(speed)
         torque = voltage * current / speed
@@ -166,7 +166,8 @@ def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[st
     rows, columns = np.nonzero(~np.isfinite(table.values))
     if len(rows):
         row, column = int(table.lines[rows[0]]), str(table.names[columns[0]])
-        raise bad_data(path, "no finite number", "one in every cell", row=row, column=column)
+        expected = "a finite number in every cell"
+        raise bad_data(path, "no finite number", expected, row=row, column=column)
     for name in needed:
         if name not in table.names:
             expected = f"one of {', '.join(map(str, table.names))}"
@@ -217,7 +218,7 @@ def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
 
 
 def leave_one_surface_out(logs: Iterable[Log]) -> Content:
-    """Return the errors of curves fitted to other surfaces, or to a surface itself, on its slip.
+    """Return the errors of slip on each surface, by curves fitted to the others or to itself.
 
     Poses are used as the camera logged them, without correction of its scale and lag.
 
@@ -241,7 +242,9 @@ def leave_one_surface_out(logs: Iterable[Log]) -> Content:
     counts = {surface: len(point) for surface, point in points.items()}
     for surface, count in counts.items():
         if count < 2:
-            raise ValueError(f"surface {surface!r}: {count} samples, too few for a curve")
+            raise ValueError(
+                f"surface {surface!r}: {count} samples, too few for a curve; expected at least 2"
+            )
     current, slip = np.concatenate(list(points.values())).T
     floor = np.repeat(list(counts), list(counts.values()))
     found = errors_by_floor(slip, current, floor)

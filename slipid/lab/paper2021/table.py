@@ -36,7 +36,7 @@ DEPLOYED_THRESHOLD = 0.4
 DEPLOYED_MEMORY = 0.97
 """Weight of the previous smoothed current in the next one [-]."""
 
-# keyed by name of the form: the regressor, and its powers in the design matrix
+# keyed by name of the form: the regressor, and its exponents in the columns of the design matrix
 _FORMS = {
     "linear in M": ("torque", (1,)),
     "affine in M": ("torque", (0, 1)),

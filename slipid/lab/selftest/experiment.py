@@ -118,8 +118,8 @@ def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
 def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     """Return the paths of the parameters and ratios that a successful self test must recover.
 
-    They match the patterns in the config or, without any, patterns of what the logged channels
-    should identify.
+    These paths match the patterns in the config or, if it has none, the patterns of parameters that
+    the logged channels should identify.
 
     Raises:
         DataError: a pattern of the config matches no fitted parameter and no ratio.
@@ -129,14 +129,15 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     paths = [e.path for e in problem.space.free] + [e.path for e in ratios]
     given = config.content.selftest.wanted
     patterns = ["surface.*.creep"]
-    if problem.robot.geometry.determines_twist:  # other drives depend little on load
+    # other drives depend too little on loads and roller drag to require that these are recovered
+    if problem.robot.geometry.determines_twist:
         patterns += ["surface.*.roller_drag", "robot.load_share@*"]
     patterns += ["surface.*.friction/motor.back_emf"] if w.has_current else []
     patterns += ["motor.resistance", "motor.back_emf"] if w.has_current and w.has_voltage else []
     for pattern in given or []:
         if not matching(paths, pattern):
             raise DataError(
-                f"{config.path}: selftest.wanted '{pattern}': not fitted; "
+                f"{config.path}: selftest.wanted '{pattern}': not fitted, not even as a ratio; "
                 f"expected one of {', '.join(paths)}"
             )
     chosen = patterns if given is None else given
@@ -189,7 +190,7 @@ def number_summary(found: Sequence[NumberRecovery]) -> Content:
     """Return the summary of one parameter over all replicates.
 
     `recovered` follows from the most frequent verdict of the fits: "yes" for identified, "roughly"
-    for weak, and "no" for the others. "yes" and "roughly" become "wrong" if the errors are
+    for weak, and "no" for any other verdict. "yes" and "roughly" become "wrong" if the errors are
     significantly larger than the fits' intervals and standard deviations allow (`LEVEL`).
     """
     truth, value = np.array([f.truth for f in found]), np.array([f.value for f in found])

@@ -1,10 +1,11 @@
 """Simulation of logs of a robot whose parameters are all known, for self tests and tests.
 
 The runs are a grid of straight and turning runs, such as those of a Robotino under an overhead
-camera. The noise is that of the likelihood: of the camera, of the motion (growing with distance),
-of each run, and of the current level of each run. In addition, the logs have features of real logs
-that the likelihood does not model: encoder ticks, quantised unsigned currents with ripple,
-quantised voltages, repeated camera frames, uneven rows, and a delayed and ramped start.
+camera. The noise has the components of the likelihood: noise of the camera, noise of the motion
+(which grows with distance), and a constant error of the motion and of the currents of each run. In
+addition, the logs have features of real logs that the likelihood does not model: encoder ticks,
+quantised unsigned currents with ripple, quantised voltages, repeated camera frames, uneven rows,
+and a delayed and ramped start.
 """
 
 import hashlib
@@ -186,7 +187,7 @@ class SimulatedSensors:
 def simulate_logs(
     robot: Robot, drives: Sequence[PlannedRun], seed: int, sensors: SimulatedSensors | None = None
 ) -> list[Log]:
-    """Return simulated logs of planned runs; the robot must have their floors, loads, sessions."""
+    """Return simulated logs of planned runs on floors, loads and sessions that the robot has."""
     return _LogSimulator(
         robot, drives, sensors or SimulatedSensors(), np.random.default_rng(seed)
     ).logs()

@@ -203,8 +203,8 @@ _FILE = TypeAdapter(list[Replicate])
 def plausible(task: ConfigFitTask, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and std, in the search space, from which true parameters are drawn.
 
-    The mean is that of the prior; for the std see `TRUTH_STD_RATIO`. A parameter in
-    `[selftest.truth]` has exactly the value given there.
+    The mean is the prior mean; `TRUTH_STD_RATIO` defines the std. A parameter in `[selftest.truth]`
+    has the value given there as its mean, and a std of 0.
 
     Raises:
         DataError: `[selftest.truth]` names a parameter that does not exist or is fixed, or gives
@@ -236,8 +236,7 @@ def replicates(
 
     Args:
         task: fit task of the experiment.
-        problem: its fitting problem of the experiment; its compiled functions are used for every
-            replicate.
+        problem: fitting problem of the task, whose compiled functions are used for every replicate.
         count: number of replicates.
         seed: seed of true parameters and noise, together with the replicate's number.
         kept: checkpoint with the finished replicates, to which every new one is added.
@@ -343,7 +342,8 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
         "encoder": ends(as_increments(twist, w, truth)),
     }
     chord, floor = np.linalg.norm(true, axis=1), np.asarray(w.surface)
-    travels = chord > 0.1 * np.median(chord)  # Turns on the spot have no chord.
+    # turns on the spot have no chord by which an error could be divided
+    travels = chord > 0.1 * np.median(chord)
     error = {m: np.linalg.norm(end - true, axis=1) / chord for m, end in predicted_ends.items()}
     return {
         name: {model: float(np.mean(of_model[mine])) for model, of_model in error.items()}

@@ -10,15 +10,15 @@ Much of the slip comes from the engine's own contact law: sliding, spinning and 
 friction cone, so a roller that rolls against its rolling friction creeps under any force along its
 axle, in proportion to its rolling speed. On the surface `soft` the robot loses 36 % of its path
 length (mean of six directions, no unevenness). The loss is 31 % if the floor does not yield under
-shear, 28 % if in addition there is no resistance but that of contacts, and 11 % if in addition
-friction is ten times as large. This slip is a ratio of speeds, like the creep in `slipid.model`,
-but has another formula. Sinkage comes from the engine's contact springs, whose stiffness the engine
-scales with the mass of the robot: with the same `softness_m`, a heavier robot of the same build
-sinks in equally deep.
+shear, 28 % if compaction and body drag are switched off as well, and 11 % if friction is also ten
+times as large. This slip is a ratio of speeds, like the creep in `slipid.model`, but follows
+another formula. Sinkage comes from the engine's contact springs, whose stiffness the engine scales
+with the mass of the robot: with the same `softness_m`, a heavier robot of the same build sinks in
+equally deep.
 
-Effects added to the engine have other forms than those of `slipid.model`. A floor that yields under
-shear is modelled by a softer spring of the roller's mount; compaction ahead of a sunk wheel is a
-force that grows with a power of the sinkage; a drag force acts on the body.
+Three effects are added to the engine, with other formulas than in `slipid.model`. A floor that
+yields under shear is modelled by a softer spring of the roller's mount; compaction ahead of a sunk
+wheel is a force that grows with a power of the sinkage; a drag force acts on the body.
 
 Effects that are not simulated: bulldozing (no heap ahead of a wheel), memory (a rut vanishes when
 the wheel has left it), the height of a carpet's edge, pile direction, and water.

@@ -26,7 +26,7 @@ RESERVED = ("one_surface", "two_surfaces", "wheel_load")
 _IDENTIFY_CONFIG = """\
 # Identifies the robot of these logs:
 #   slipid identify {name} --data logs --out result
-# They were made by slipid simulate; the truth lies in truth/, which nothing reads that fits.
+# The logs were simulated by slipid simulate; the true values are in truth/, which no fit reads.
 
 [robot]
 drive = "omni"
@@ -52,7 +52,7 @@ current_is_signed = {signed}
 "motor.back_emf" = {{ start = 0.0257, prior = {{ mean = 0.04, std = 0.02 }} }}
 """
 _TRACKED_LAYOUT = """
-# what `slipid track` makes of the video of each run, such as:
+# poses of each run, tracked in its video by slipid track, for example:
 #   slipid track video/as_built/firm/run000.avi --camera video/camera.json \\
 #     --marker-size {size} --marker-height {height} --out logs/as_built/firm/run000.poses.csv
 [layouts.testsite.beside."{{stem}}.poses.csv"]
@@ -93,7 +93,8 @@ def plan(path: Path, text: str) -> SimulationPlan:
     """
     mapping = mapping_of(path, text)
     surfaces = mapping.get("surfaces", {})
-    if isinstance(surfaces, dict):  # keys that the config omits keep their default values
+    # a built-in surface that the config changes keeps its built-in values for omitted keys
+    if isinstance(surfaces, dict):
         known = {
             name: {**asdict(SURFACES[name]), **given}
             for name, given in surfaces.items()
@@ -121,7 +122,7 @@ def plan(path: Path, text: str) -> SimulationPlan:
         if not any(fnmatch(name, pattern) for name, _ in named):
             folders = ", ".join(dict.fromkeys(f"{name[:-3]}*" for name, _ in named))
             raise DataError(
-                f"{path}: video: no run is named '{pattern}'; expected names of runs in {folders}"
+                f"{path}: video: no run matches '{pattern}'; expected names of runs, {folders}"
             )
     filmed = tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video))
     return SimulationPlan(_hash(content, site, maps), content, site, maps, named, filmed)
@@ -134,8 +135,8 @@ def _check(
     for load in site.robot.centres_m:
         if not re.fullmatch("[A-Za-z0-9_-]+", load) or load in RESERVED:
             raise DataError(
-                f"{path}: robot.centres_m: load '{load}'; expected letters, digits, _ and -, "
-                f"none of {', '.join(RESERVED)}"
+                f"{path}: robot.centres_m: '{load}' cannot be the name of a load set-up; expected "
+                f"letters, digits, _ and -, and none of {', '.join(RESERVED)}"
             )
     for k, runs in enumerate(content.runs, 1):
         _refuse_unknown(path, f"runs[{k}].load", runs.load, site.robot.centres_m)
@@ -241,11 +242,11 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
 
 
 def _map_sets(plan: SimulationPlan) -> list[tuple[str, str]]:
-    """Return (load set-up, map) of the runs on maps that a fit can use.
+    """Return the pairs (load set-up, map) of those runs on maps that a fit can use.
 
-    These are the maps whose surfaces all have separate runs on them, and the load set-ups of such
-    runs. Poses of runs on maps are logged in the frame of the map, also if another pose was used
-    for steering.
+    A fit can use a run on a map if every surface of the map, and the load set-up of the run, also
+    occur in runs on a single surface. Poses of runs on maps are logged in the frame of the map,
+    even if the robot was steered by dead reckoning.
     """
     one = [run for _, run in plan.runs if run.surface is not None]
     floors, loads = {run.surface for run in one}, {run.load for run in one}

@@ -43,7 +43,7 @@ class Waypoints:
     """Closed-loop program: positions to reach one after the other, without turning.
 
     Attributes:
-        places: x, y [m] in the frame of the pose.
+        places: x, y of the positions [m], in the frame of the pose that `by` chooses.
         speed: speed between the positions [m/s].
         by: pose that is used as feedback: `encoders` (dead reckoning from the start) or `camera`
             (the true pose).
@@ -56,9 +56,11 @@ class Waypoints:
     def twists(self, plant: SimulatedRobot) -> Iterator[BodyTwist]:
         """Yield the twist of each period, in the body frame, until all positions are reached.
 
-        It ends earlier if too much time passes: 10 s and three times the duration without slip.
+        Iteration also ends if the run takes longer than 10 s plus three times its duration without
+        slip.
         """
-        # the start is not among the places: the leg from it is replaced by one from the last place
+        # the longest allowed duration needs the length of all legs; the start is not in `places`,
+        # so the first leg is taken as long as that from the last position to the first
         corners = np.array([self.places[-1], *self.places])
         longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / self.speed
         pose, back = np.zeros(3), np.linalg.pinv(plant.robot.wheel_from_twist)
@@ -108,7 +110,7 @@ class SiteRun:
 
     @property
     def folder(self) -> str:
-        """Name of the folder of the log: that of the floor or, without one, that of the surface."""
+        """Name of the log's folder: the floor's name or, if it has none, the surface's name."""
         return self.place or str(self.surface)
 
     @property
@@ -120,15 +122,15 @@ class SiteRun:
 def straight(
     surface: str, load: str, heading: float, speed: float, distance: float, turn: float = 0.0
 ) -> SiteRun:
-    """Return a run with a constant command; without slip, the middle of its path is the origin.
+    """Return a run with a constant command; a straight path without slip is centred on the origin.
 
     Args:
         surface: name of the surface.
         load: name of the load set-up.
         heading: direction of the commanded motion in the body frame [rad].
         speed: commanded speed [m/s]; 0 for a turn on the spot.
-        distance: commanded path length; for a turn on the spot, that of a point at 0.125 m from the
-            middle [m].
+        distance: commanded path length [m]; for a turn on the spot, the arc length of a point at
+            0.125 m from the middle of the robot [m].
         turn: commanded turn rate [rad/s].
     """
     seconds = distance / (speed or abs(turn) * 0.125)
@@ -218,7 +220,7 @@ def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Tr
     rows: list[tuple[float | list[float] | np.ndarray, ...]] = []
 
     def record() -> None:
-        """Keep the engine's state, in the order of the fields of `Trace`."""
+        """Append the engine's state to `rows`, in the order of the fields of `Trace`."""
         p, d = plant, plant.data
         body, angle = d.qpos[:7].copy(), d.qpos[p.wheel_at] - p.angle_at_start
         wheels = angle, d.qvel[p.wheel_dof], rims.speed

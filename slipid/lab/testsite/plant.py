@@ -61,7 +61,7 @@ class SimulatedRobot:
     ):
         self.robot, self.dt = site.robot, timestep
         mujoco = engine()
-        # By default, MuJoCo writes warnings to a file; `check` uses the counts of the engine.
+        # stop MuJoCo from writing warnings to a file: `check` reads the engine's warning counts
         mujoco.set_mju_user_warning(lambda text: None)
         self._step = mujoco.mj_step
         self.model = mujoco.MjModel.from_xml_string(
@@ -112,7 +112,7 @@ class SimulatedRobot:
     def check(self) -> None:
         """Raise `DataError` if the simulation became unstable.
 
-        The engine only counts a warning, resets the robot and continues.
+        The engine itself does not stop: it counts a warning, resets the robot and continues.
         """
         mujoco = engine()
         kinds = [f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC")]
@@ -142,7 +142,7 @@ class SimulatedRobot:
         m.dof_damping[self.wheel_dof] = motor.viscous_nms
 
     def _store_contacts(self, terrain: Terrain) -> None:
-        """Store the contact parameters of every kind of floor in the terrain."""
+        """Store contact parameters for every kind (surface and unevenness level) of the terrain."""
         self.terrain = terrain
         kinds = terrain.kinds
         self._friction = np.array([[g.friction, 0.003, f * g.rolling_m] for g, f in kinds])
@@ -165,7 +165,7 @@ class SimulatedRobot:
     def _look(self) -> None:
         """Give every roller the contact parameters of the floor beneath it.
 
-        The bearings of rollers above the floor have no friction, which saves computing time.
+        Rollers that are not near the floor get no bearing friction, which saves computing time.
         """
         place = self.data.geom_xpos[self._roller]
         now, m = self.terrain.at(place[:, :2]), self.model
@@ -202,5 +202,6 @@ class SimulatedRobot:
         fx, fy = fx - size * vx, fy - size * vy
         heading = self.pose[2]
         c, s = np.cos(heading), np.sin(heading)
-        mx, my = z0 * fy, -z0 * fx  # The force acts at the floor, z0 below the wheel axes.
+        # the force acts at the floor, z0 below the wheel axes, and so also tilts the chassis
+        mx, my = z0 * fy, -z0 * fx
         d.qfrc_applied[:6] = [fx, fy, 0.0, c * mx + s * my, c * my - s * mx, moment]

@@ -145,8 +145,8 @@ class RobotBuild:
         mass_kg: mass of the whole robot [kg].
         centres_m: x, y of the centre of mass, keyed by load set-up [m].
         centre_height_m: height of the centre of mass above the wheel axes [m].
-        wheel_azimuths_deg: azimuths of the wheel centres; the drive direction of each wheel is 90
-            deg further [deg].
+        wheel_azimuths_deg: azimuths of the wheel centres [deg]; the drive direction of each wheel
+            is its azimuth plus 90 deg.
         base_radius_m: distance from the middle of the robot to the wheel centres [m].
         wheel_radius_m: radius of the wheels [m].
         gear_ratio: turns of the motor per turn of the wheel.
@@ -197,15 +197,19 @@ class RobotBuild:
             )
         if np.linalg.cond(self.wheel_from_twist * self.wheel_radius_m) > 100:
             raise ValueError(
-                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}; expected angles all around"
+                f"wheel_azimuths_deg = {self.wheel_azimuths_deg}: the wheels are too close "
+                "together to move the body in all directions; expected angles all around"
             )
         if not self.marker_height_m >= self.wheel_radius_m + 0.08:
             raise ValueError(
-                f"marker_height_m = {self.marker_height_m}; expected 0.08 above the wheel axes"
+                f"marker_height_m = {self.marker_height_m}; expected at least wheel_radius_m + 0.08"
             )
         for name in self.centres_m:
             if not self.load_share(name).min() > 0.02:
-                raise ValueError(f"load {name}: the centre of mass is not within the wheels")
+                raise ValueError(
+                    f"centres_m.{name}: the centre of mass is not well within the wheels; expected "
+                    "a position at which every wheel carries over 2 % of the weight"
+                )
 
     @property
     def own_mass_kg(self) -> float:
@@ -247,8 +251,8 @@ def mjcf(
 ) -> str:
     """Return a MuJoCo model (XML) of the robot at the origin of a flat floor.
 
-    Contact parameters of the rollers override those of the floor, so that `plant` can set those of
-    the surface beneath each roller.
+    Contact parameters of the rollers override those of the floor, so that `SimulatedRobot` can give
+    each roller the parameters of the surface beneath it.
 
     Args:
         robot: dimensions and masses of the robot.
@@ -259,7 +263,8 @@ def mjcf(
         floor_looks: XML attributes of the floor's plane for pictures.
     """
     m = robot
-    # place the chassis' centre of mass so that the whole robot has that of the load set-up
+    # place the chassis' centre of mass so that the centre of mass of the whole robot, wheels
+    # included, is that of the load set-up
     wheels = (m.mass_kg - m.own_mass_kg) * m.places.mean(axis=0)
     x, y = (m.mass_kg * np.array(m.centres_m[load]) - wheels) / m.own_mass_kg
     inertia = m.own_mass_kg * np.array([0.012, 0.012, 0.016])
@@ -307,7 +312,7 @@ def _wheel(m: RobotBuild, k: int) -> str:
     azimuth = np.radians(m.wheel_azimuths_deg[k])
     x, y = m.places[k]
     ring = m.wheel_radius_m - m.roller_radius_m
-    # `half`: half of a roller's length, with which the rollers of both rows meet at the rim
+    # `half` is half the roller length at which neighbouring rollers of the two rows just meet
     step = np.pi / m.rollers
     half = ring * (1 - np.cos(step)) / np.sin(step)
     parts = [

@@ -45,7 +45,10 @@ class Patchwork(Section):
 
 
 class FourZones(Section):
-    """Floor map of four surfaces around the middle of the rectangle of the 2021 paper's trial."""
+    """Floor map of four square zones with one surface each, which share a corner.
+
+    The shared corner is the centre of the rectangular path that `RectangleRuns` drives.
+    """
 
     kind: Literal["four_zones"] = "four_zones"
     surfaces: list[str] = Field(min_length=4, max_length=4)
@@ -101,7 +104,7 @@ class CurveRuns(SurfaceRuns):
 class PaperGridRuns(SurfaceRuns):
     """The 2021 paper's grid of runs: along x, y and the diagonals, and turns on the spot.
 
-    Each of them is driven in both senses.
+    Each motion is driven in both directions.
     """
 
     kind: Literal["paper_grid"] = "paper_grid"
@@ -143,7 +146,10 @@ class WanderRuns(MapRuns):
         low, high = np.array([x0, y0]) + 0.3, np.array([x1, y1]) - 0.3
         if (low >= high).any():
             size = f"{x1 - x0:g} x {y1 - y0:g} m"
-            raise ValueError(f"a floor of {size}; expected more than 0.6 x 0.6 m")
+            raise ValueError(
+                f"a floor of {size}; expected more than 0.6 x 0.6 m, since way-points keep 0.3 m "
+                "from its edges"
+            )
         out = []
         for _ in range(self.count):
             (x, y), *goals = rng.uniform(low, high, (self.points + 1, 2)).tolist()
@@ -157,8 +163,8 @@ class WanderRuns(MapRuns):
 class RectangleRuns(MapRuns):
     """Runs along the 2021 paper's rectangle of 900 x 400 mm on a map, without turning.
 
-    The sides are driven forward, right, back, left. With `by = "encoders"` the corners are reached
-    by the robot's dead reckoning.
+    The sides are driven forward, right, back, left. With `by = "encoders"` the robot steers to the
+    corners by dead reckoning.
     """
 
     kind: Literal["rectangle"] = "rectangle"
@@ -170,7 +176,7 @@ class RectangleRuns(MapRuns):
         x0, y0, x1, y1 = floor.extent
         if not (x0 <= 0 <= x1 and y0 <= 0 <= y1):
             raise ValueError(
-                f"it starts at 0, 0, but map {self.map} reaches from {x0:g}, {y0:g} to "
+                f"the rectangle starts at 0, 0, but map {self.map} reaches from {x0:g}, {y0:g} to "
                 f"{x1:g}, {y1:g}; expected a map around the start"
             )
         corners = ((0.9, 0.0), (0.9, -0.4), (0.0, -0.4), (0.0, 0.0))

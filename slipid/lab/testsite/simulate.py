@@ -212,7 +212,7 @@ def drive_and_write(task: SiteTask) -> float:
     """Drive one run, write its logs and its truth, and return the simulated duration [s]."""
     try:
         trace = drive(task.run, task.site, task.seed)
-    except ValueError as error:  # The engine also raises this for a robot that it cannot build.
+    except ValueError as error:  # MuJoCo also raises ValueError for a model it cannot compile.
         raise DataError(f"{task.name}: {error}") from error
     site = task.site
     gear, ticks = site.robot.gear_ratio, site.motor.ticks_per_revolution

@@ -139,8 +139,8 @@ class SiteCamera:
         flicker: relative amplitude of changes of the light over some seconds.
         exposure_s: exposure time of a frame; moving objects appear twice, at its start and end [s].
         frame_s: time between frames [s].
-        early_s: time by which the video starts before the robot's log; video times count from its
-            own start, so they are ahead of the log's by the same time [s].
+        early_s: time by which the video starts before the robot's log [s]; times in the video file
+            count from the video's start, so they are larger than log times by `early_s`.
     """
 
     height_m: Positive = 2.2
@@ -170,7 +170,7 @@ class SiteCamera:
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation from the world to OpenCV's camera axes: x right, y down, z away."""
+        """Rotation from world axes to OpenCV's camera axes: x right, y down, z along the view."""
         tilted = Rotation.from_euler("xy", self.tilt_deg, degrees=True)
         return np.asarray(tilted.as_matrix() @ np.diag([-1.0, 1.0, -1.0]))
 

@@ -1,7 +1,7 @@
 """Videos of runs on the test site: frames with marker, floor, perspective and lens distortion.
 
-Drawing needs OpenGL without a screen: EGL, which runs in software without a graphics card. Driving
-runs does not need it.
+Drawing needs OpenGL without a screen: EGL, which runs in software without a graphics card. To
+simulate runs without videos, no OpenGL is needed.
 """
 
 import os
@@ -54,7 +54,7 @@ class Studio:
         carpet = _carpet(floor, site, (x0, y0, x1, y1), self._rng)
         assets = {"floor.png": _png(cv2, carpet), "marker.png": _png(cv2, _marker(cv2))}
         fovy = np.degrees(2 * np.arctan(0.5 * DRAWN_SHARE * camera.height_px / camera.focal_px))
-        # MuJoCo's cameras look along -z with y up
+        # turn OpenCV's camera axes into those of MuJoCo's cameras, which look along -z with y up
         axes = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
         frame = " ".join(str(float(v)) for v in (*axes[:, 0], *axes[:, 1]))
         place = " ".join(str(float(v)) for v in camera.place)
@@ -129,7 +129,7 @@ class Studio:
             image = self._cv2.GaussianBlur(image, (0, 0), c.blur_px)
         fast, slow = np.sin(2 * np.pi * time / np.array([1.7, 7.3]) + self._light)
         image = image * (1 + c.flicker * (0.3 * fast + 0.7 * slow))
-        # all frames have the same noise pattern, shifted at random
+        # shift one noise pattern at random, which is faster than new noise for every frame
         row, column = self._rng.integers(_SHIFT, size=2)
         image = image + self._grain[row : row + c.height_px, column : column + c.width_px]
         return np.clip(image, 0, 255).astype(np.uint8)
@@ -172,7 +172,10 @@ def film(
     code = cv2.VideoWriter.fourcc(*"MJPG")
     video = cv2.VideoWriter(str(unfinished), code, 1 / c.frame_s, (c.width_px, c.height_px))
     if not video.isOpened():
-        raise DataError(f"{path}: OpenCV cannot write a video there")
+        raise DataError(
+            f"{path}: OpenCV cannot write this video; expected a writable folder and an OpenCV "
+            "with Motion JPEG"
+        )
     try:
         for t in frames:
             video.write(studio.exposed(float(t), at))
@@ -229,7 +232,7 @@ def _carpet(
 
 
 def _marker(cv2: ModuleType) -> np.ndarray:
-    """Return a picture of the marker; its top edge is at the right, the body's front."""
+    """Return a picture of the marker; its top edge is on the right, towards the body's front."""
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     drawn = np.rot90(cv2.aruco.generateImageMarker(book, MARKER, 480), -1)
     return np.repeat(drawn[..., None], 3, axis=2)

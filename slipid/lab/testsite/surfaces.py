@@ -30,13 +30,14 @@ class SurfacePhysics:
     """Physics of one surface.
 
     Attributes:
-        friction: Coulomb coefficient of a roller on it [1].
+        friction: Coulomb friction coefficient between a roller and the surface [1].
         rolling_m: lever arm of the rolling friction, about both axes of a roller [m].
         softness_m: approximate sinkage of a wheel that carries a third of the robot, for any weight
             of the robot [m].
         shear_n_m: horizontal stiffness of the floor beneath one roller [N/m].
-        compaction: resistance of a sunk wheel per sinkage to the power of 1.5 [N/m^1.5].
-        body_drag_n: drag force on the body against its translation, such as of a deep pile [N].
+        compaction: resistance force of a sunk wheel over its sinkage to the power of 1.5
+            [N/m^1.5].
+        body_drag_n: drag force against translation of the body, as by a deep carpet pile [N].
         rib_height_m, rib_distance_m: height of ribs along y, and distance between them [m]; by
             default there are none.
         unevenness: std, over the floor, of the logarithm of rolling friction and shear stiffness
@@ -116,7 +117,8 @@ def _random_levels(
     number = 2 * np.pi / rng.uniform(0.08, 0.3, waves)
     phase = rng.uniform(0, 2 * np.pi, waves)
     field = np.zeros((len(y), len(x)))
-    for a, k, p in zip(angle, number, phase, strict=True):  # sin(u + v) from its parts
+    # add sin(u + v) of each wave by the addition theorem: sines of vectors, not of the whole grid
+    for a, k, p in zip(angle, number, phase, strict=True):
         u, v = k * np.cos(a) * x + p, k * np.sin(a) * y
         field += np.outer(np.cos(v), np.sin(u)) + np.outer(np.sin(v), np.cos(u))
     field *= (2 / waves) ** 0.5

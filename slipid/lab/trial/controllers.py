@@ -1,4 +1,4 @@
-"""Controllers of a trial, the rows of its table: those of slipid and published control laws."""
+"""Controllers that a trial compares: those of slipid, and published control laws."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -40,8 +40,8 @@ def _indiveri(robot: DeployedRobot) -> Law:
 def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     """Tune the gains of Goswami and Padhy's control law on two sides of the rectangle [1/s].
 
-    The other two sides are mirror images. The tuning uses an ideal robot with the default delay and
-    lag of twins, so that the gains are the same for all robots.
+    The remaining two sides are mirror images of the first two. The tuning simulates a robot without
+    slip, with the default delay and lag of twins, so that the gains are the same for all robots.
     """
     path, actuators = rectangle(), ActuatorModel()
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
@@ -62,11 +62,11 @@ ROWS: Mapping[str, ControllerRow] = {
     ),
     "goswami_padhy_gradient": ControllerRow(
         "encoder",
-        "and gains by the gradient",
+        "law of Goswami and Padhy, gains by gradient",
         law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("gradient"))),
     ),
     "indiveri": ControllerRow(
-        "encoder", "law of Indiveri, with a limit that keeps the direction", law=_indiveri
+        "encoder", "law of Indiveri, whose speed limit keeps the direction", law=_indiveri
     ),
 }
 """Controllers by name: those of slipid and of the 2021 paper, then the published laws."""
@@ -76,13 +76,13 @@ def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
     """Return the controllers among `names` that can drive a robot.
 
     Raises:
-        DataError: none of them can.
+        DataError: none of the controllers `names` can drive the robot.
     """
     kept = tuple(name for name in names if ROWS[name].drives(robot))
     if not kept:
         raise DataError(
             f"{', '.join(names)}: only for robots with {PAPER_WHEELS} wheels, like that of the "
-            f"2021 paper; this robot has {robot.wheels}; expected some of "
+            f"2021 paper; this robot has {robot.wheels}; expected one of "
             f"{', '.join(name for name, row in ROWS.items() if row.drives(robot))}"
         )
     return kept
@@ -92,7 +92,7 @@ def check_gains(out: Path, robot: DeployedRobot) -> None:
     """Raise `DataError` if the robot's file, in `out`, has no tuned gains for its load set-up."""
     tuned, path = robot.record.gains, out / "robot.json"
     if tuned is None:
-        raise DataError(f"{path}: it has no tuned gains; omit --tuned-gains")
+        raise DataError(f"{path}: the robot has no tuned gains; omit --tuned-gains")
     if tuned.load != robot.load_setup:
         raise DataError(
             f"{path}: gains were tuned for another load set-up ({tuned.load}), not for "
@@ -101,9 +101,10 @@ def check_gains(out: Path, robot: DeployedRobot) -> None:
 
 
 def unused_gains(robot: DeployedRobot, forced: bool) -> str:
-    """Return a sentence about tuned gains in the robot file that are not used, with the reason.
+    """Return a sentence that says which tuned gains of the robot file are not used, and why.
 
-    It is empty if all are used, or there are none. `forced` is the option --tuned-gains.
+    The text is empty if all tuned gains are used, or if the file has none. `forced` is True if the
+    option --tuned-gains is given.
     """
     tuned = robot.record.gains
     if tuned is None:
@@ -113,8 +114,8 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
-            f"{tuned.loss.hand:.1f} mm): driving with those set by hand; use --tuned-gains for "
-            "the tuned ones"
+            f"{tuned.loss.hand:.1f} mm): driving with gains set by hand; use --tuned-gains for "
+            "the tuned gains"
         )
     if tuned.values.ahead.value == 0.0:
         return ""

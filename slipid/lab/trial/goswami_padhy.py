@@ -7,10 +7,9 @@ heading error e_th, the path's position p_d and turn rate W_d, and the heading t
     V = (e_x^2 + e_y^2) / 2 + 1 - cos e_th,   V' = -k1 e_x^2 - k2 e_y^2 - k3 sin^2 e_th
 
 so that the Lyapunov function V falls for all positive gains, if the robot follows commands at once.
-
-Gains are tuned on an ideal robot with delay and lag: among gains in [0, 5], those that minimise the
-integral of V over time, from start poses off the reference path. For a robot with the lag of the
-twin, k1 and k2 end at the upper bound, 5, and k3 at 4.67.
+The gains are tuned by simulation of a robot without slip, but with delay and lag: they are the
+gains in [0, 5] that minimise the integral of V over time, from start poses off the reference path.
+For the delay and lag of the twin, k1 and k2 end at the upper bound, 5, and k3 at 4.67.
 
 - row `goswami_padhy`: by a swarm of 30 particles in 50 iterations, inertia 0.7, c1 = c2 = 1.5.
 - row `goswami_padhy_gradient`: the same integral is minimised by a quasi-Newton method with bounds
@@ -24,15 +23,14 @@ with r1, r2 uniform in [0, 1], drawn anew for every particle, coordinate and ite
 of the swarm are those of Goswami and Padhy 2018 and are not tuned.
 
 Liberties:
-
 - The law is the form for robots that can drive sideways, as other papers quote it; the text of the
   paper itself was not available.
 - The tuned cost is the integral of V along the path of the trial, from several start poses off the
   path, for a robot without slip whose twist follows commands with the twin's delay and lag. The
   paper's own robot, path and cost are not reproduced.
-- In the tuning, all wheels have the same delay and lag, which the twist then has too; speed,
-  acceleration and voltage are not limited, the pose is known, and the path does not wait for the
-  robot.
+- In the tuning, all wheels have the same delay and lag, so that the twist has this delay and lag,
+  too; speed, acceleration and voltage are not limited, the pose is known, and the path does not
+  wait for the robot.
 - As in all rows of the trial, the law is evaluated once per period with the pose by the encoders,
   and its commands are subject to the same limits.
 - Particles start at rest at uniformly random points of the box. A coordinate that would leave the
@@ -82,9 +80,10 @@ def minimise(
     swarm: Swarm,
     seed: int = 0,
 ) -> tuple[Float[np.ndarray, " n"], list[float]]:
-    """Return the best point that a swarm finds in a box, and how the smallest cost so far fell.
+    """Return the best point that a swarm finds in a box, and the history of the smallest cost.
 
-    It is given for the start and after each iteration. The same seed gives the same results.
+    The history has the smallest cost found so far, at the start and after each iteration. The same
+    seed gives the same results.
 
     Args:
         cost: function to minimise.
@@ -116,9 +115,9 @@ def _finite(cost: Float[np.ndarray, " particle"]) -> Float[np.ndarray, " particl
 
 
 Numbers = Array | np.ndarray
-"""Arrays of the law: of jax when it drives a robot, of numpy when many gains are tuned at once.
-
-The first axis of vectors has x, y and yaw: poses, errors, rates, twists, or gains."""
+"""Arrays in the control law: jax arrays when the law drives a robot, numpy arrays when many gains
+are evaluated at once. Poses, errors, rates, twists and gains have x, y and yaw on the first axis.
+"""
 LOW_GAINS, HIGH_GAINS = np.zeros(3), np.full(3, 5.0)
 """Bounds of the gains [1/s]."""
 GAIN_STEP = 1e-4
@@ -126,14 +125,14 @@ GAIN_STEP = 1e-4
 
 
 def in_body(v: Numbers, heading: Numbers) -> Numbers:
-    """Return vectors (x, y, yaw) of world axes in the axes of bodies at their headings [rad]."""
+    """Return vectors (x, y, yaw), given in world axes, in the axes of bodies at headings [rad]."""
     of = heading.__array_namespace__()
     c, s = of.cos(heading), of.sin(heading)
     return of.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], v[2]])
 
 
 def tracking_error(wanted: Numbers, pose: Numbers) -> Numbers:
-    """Return reference less actual pose: position in body axes [m, m] and heading [rad]."""
+    """Return the reference pose less the actual one: body axes x, y [m, m] and heading [rad]."""
     return in_body(wanted - pose, pose[2])
 
 
@@ -173,7 +172,7 @@ class GoswamiPadhy(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class TuningTask:
-    """Simulation with which gains are tuned: an ideal robot with delay and lag follows a path.
+    """Simulation with which gains are tuned: a robot with delay and lag, without slip, on a path.
 
     Attributes:
         reference: pose and rates of the path [m, m, rad, m/s, m/s, rad/s], one row per period.
@@ -192,7 +191,7 @@ class TuningTask:
     period: float
 
     def integrals(self, gains: Places) -> Float[np.ndarray, " particle"]:
-        """Return the mean over starts of the integral of V over time, for many gains at once."""
+        """Return, for each set of gains, the integral of V over time, averaged over the starts."""
         k, h = gains.T[..., None], self.period / len(self.delay_weights)
         pose = np.repeat(self.begin.T[:, None], len(gains), axis=1)
         velocity, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
@@ -212,7 +211,7 @@ class TuningTask:
     def slope(self, gains: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
         """Return the mean integral of V, and its derivative with respect to the gains.
 
-        The derivative is by central differences.
+        The derivative is computed by central differences.
         """
         off = GAIN_STEP * np.eye(3)
         value = self.integrals(gains + np.concatenate([np.zeros((1, 3)), off, -off]))

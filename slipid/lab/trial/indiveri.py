@@ -16,17 +16,17 @@ the pose loop commands the twist xi = (v, W),
 so that a robot whose wheels reach their limit w_max still moves in the commanded direction, only
 slower: while the path rests, position errors fall along the same straight line for any limit.
 
-Nothing is tuned: gains are the hand-set ones of slipid's pose loop.
+Nothing is tuned: the gains are the hand-set gains of slipid's pose loop.
 
 Liberties:
 
 - The law is implemented from its equations in other papers; the text of the paper itself was not
   available. Its other treatments of wheels at their limit are not included; here one factor scales
   translation and turning together.
-- The gains are not those of the paper. The row `encoder` has the same gains. It differs from this
-  one by the sine of the heading error, and by the scaling above, after which the limits of all rows
-  apply once more: while no wheel is at its limit, the two rows are nearly the same.
-- w_max is the limit of all rows, not the robot's own.
+- The gains are not those of the paper, but those of the row `encoder`. That row uses the sine of
+  the heading error and lacks the scaling above. After the scaling, the limits that all rows share
+  apply as well. While no wheel is at its limit, the two rows are nearly the same.
+- w_max is the wheel speed limit that all rows share, not that of the actual robot.
 - As in all rows, the path waits for a robot that lags behind, and limits of body speed, wheel
   acceleration and voltage apply in addition to w_max.
 - The pose is that estimated by the encoders.
@@ -41,7 +41,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 LEAST_SINE = 0.05
-"""Sine of the angle of rollers to the drive direction below which a wheel cannot drive."""
+"""Smallest sine of the angle between drive direction and free rolling line of a usable wheel."""
 
 
 def inverse_kinematics(
@@ -75,7 +75,10 @@ def inverse_kinematics(
     lever = place[:, 0] * n[:, 1] - place[:, 1] * n[:, 0]
     matrix = np.column_stack([n, lever]) / (radius * across)[:, None]
     if np.linalg.matrix_rank(matrix, tol=1e-6 * np.abs(matrix).max()) < 3:
-        raise ValueError("the wheels leave a motion of the body free; expected wheels that fix it")
+        raise ValueError(
+            "the wheel speeds do not determine the motion of the body; expected wheels that push "
+            "in x, y and yaw"
+        )
     return matrix
 
 

@@ -17,8 +17,8 @@ from slipid.support.errors import DataError
 
 
 def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
-    """Raise `DataError` if the test site lacks a surface, the load set-up or so many wheels."""
-    robot, other = Site().robot, "With --plant twin, the identified model itself is simulated"
+    """Raise `DataError` if the test site lacks a surface or load set-up, or `wheels` differs."""
+    robot, other = Site().robot, "Use --plant twin, which simulates the identified model itself"
     has = len(robot.wheel_azimuths_deg)
     if wheels != has:
         raise DataError(f"the test site's robot has {has} wheels, the fit's {wheels}. {other}")
@@ -35,7 +35,7 @@ def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
 class SitePlant:
     """The virtual test site as a plant of `slipid.robot.closed_loop`.
 
-    Commands act with the site's delay and limited acceleration.
+    Commands take effect after the site's delay, and with limited acceleration.
 
     Args:
         floor: map of the surfaces.

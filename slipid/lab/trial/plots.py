@@ -50,7 +50,7 @@ def trial_plot(trial: TrialResult, path: Path) -> Path:
 
 
 def _verdict(content: Content) -> str:
-    """Return a title that names the controller with the smallest closure error, if one is best."""
+    """Return the part of the title that names the best controller, or those that do not differ."""
     best = content["closes_best"]
     if best is None:
         return f"{', '.join(content['not_told_apart'])} do not differ significantly"

@@ -12,7 +12,7 @@ from slipid.support.content import Content
 DRAWS = 2000
 """Number of draws of the bootstrap over starts."""
 COMPARED = ("closure_error_median", "cross_track_rmse", "first_side_along_track_mm")
-"""Errors whose medians are compared with those of the controller `encoder`, see `columns`."""
+"""Errors (defined in `columns`) whose medians are compared with those of controller `encoder`."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ def summaries(runs: Sequence[TrialRun]) -> dict[str, Content]:
 def best_controllers(runs: Sequence[TrialRun]) -> tuple[str, ...]:
     """Return the controllers that may have the smallest closure error, the lowest median first.
 
-    After it come those whose errors are not clearly larger: the 90 % bootstrap interval of the
-    difference of medians, over the same starts, includes 0. Only controllers with the smallest
-    number of unfinished runs are considered.
+    After the controller with the lowest median come those that are not clearly worse: the 90 %
+    bootstrap interval of the difference of medians, over the same starts, does not lie above 0.
+    Only controllers with the smallest number of unfinished runs are considered.
     """
     of = _by_controller(runs)
     unfinished = {name: sum(not run.metrics.finished for run in mine) for name, mine in of.items()}

@@ -51,8 +51,8 @@ class TrialTask:
     Attributes:
         name: name of the run, `CONTROLLER/startNN`.
         row: name of the controller.
-        path: reference path, from the origin.
-        start: start pose [m, m, rad].
+        path: reference path that begins at the origin.
+        start: pose to which the path is moved and at which the robot starts [m, m, rad].
         seed: seed of all random numbers.
         plant: `testsite` or `twin`.
         floor: map of the floor on which the robot drives.
@@ -115,8 +115,8 @@ class TrialResult:
     Attributes:
         content: content of trial.json.
         runs: runs that the content summarises.
-        paths: true poses (step, 3) of every run, by its name.
-        wanted: positions on the reference path, from the origin (row, 2) [m].
+        paths: true poses (step, 3) of every run, keyed by the run's name.
+        wanted: positions (row, 2) on the reference path that begins at the origin [m].
         floor: map of the floor on which the robot drove.
     """
 
@@ -141,7 +141,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     tasks = _tasks(out, options)
     rows = tuple(dict.fromkeys(task.row for task in tasks))
     if unsuited := [name for name in options.controllers if name not in rows]:
-        report.line(f"left out, since they are for robots with three wheels: {', '.join(unsuited)}")
+        report.line(f"omitted, because they need three wheels: {', '.join(unsuited)}")
     if unused := unused_gains(tasks[0].robot, options.tuned_gains):
         report.line(unused)
     todo = {task.name: task for task in tasks if _finished_run(task) is None}
@@ -175,13 +175,14 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
         raise DataError(f"no plant '{options.plant}'; expected {' or '.join(PLANTS)}")
     unknown = [f" '{name}'" for name in options.controllers if name not in ROWS]
     if unknown or not options.controllers:
-        raise DataError(f"no controller{''.join(unknown[:1])}; expected some of {', '.join(ROWS)}")
+        raise DataError(f"no controller{''.join(unknown[:1])}; expected one of {', '.join(ROWS)}")
     robot = jax.tree.map(np.asarray, read_robot(out, options.load))
     path = path_of(options.path, options.speed, robot)
     floor = twin_floor(robot) if options.map is None else read_map(options.map)
     known_map = floor if options.told_map is None else read_map(options.told_map)
     settings, actuators = Settings.of(robot), actuator_model_of(robot, gyro=False)
-    if options.plant == "testsite":  # the site's sensors do not depend on those of the logs
+    # the test site has its own sensors and actuators, whatever the logged robot had
+    if options.plant == "testsite":
         refuse_unknown_to_site(floor, robot.load_setup, robot.wheels)
         settings, actuators = replace(settings, current_is_signed=False), ActuatorModel()
     else:
@@ -195,7 +196,7 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     key = key_of(
         *(*about, settings, actuators, *jax.tree.leaves(robot)),
         *(part for m in (floor, known_map) for part in (m.surfaces, m.corner, m.cell, m.cells)),
-        # Runs of another version of this code are not reused.
+        # a hash of the code, so that runs of another version of it are not reused
         source_hash("robot", "model", "lab/testsite", "data", "deploy", "lab/trial"),
     )
     # trials with other gains or floors have separate folders, so that their runs stay reusable

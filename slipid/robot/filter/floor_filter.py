@@ -214,7 +214,7 @@ class FloorFilter(eqx.Module):
         on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
         rim = f.frame.radius * f.at_wheels(w)
         twist, pull = settle(near.T, rim, on, f.by_wheels)
-        drag = Balance(rim[:, None], on).rolling_drag(Planar(*twist))
+        drag = Balance(rim[:, None], on).at(Planar(*twist)).rolling_drag
         opposing = f.motor.opposing_force(jnp.stack([pull, drag], axis=-1))
         force = on.friction * f.mass * GRAVITY * opposing
         torque = f.at_drives((force * f.frame.radius).T)
@@ -242,7 +242,7 @@ class FloorFilter(eqx.Module):
             # the mean is subtracted
             return jax.jvp(force, (mu,), (part - mu * jnp.mean(part),))[1]
 
-        slope = solve3(Balance(rim, on).jacobian(xi), jax.vmap(pushed)(each.T))
+        slope = solve3(Balance(rim, on).at(xi).jacobian(), jax.vmap(pushed)(each.T))
         most = length(twist[:2]) + f.frame.base * jnp.abs(twist[2])
         most = most * jnp.stack([jnp.ones(()), jnp.ones(()), 1 / f.frame.base])[:, None]
         return -jnp.nan_to_num(jnp.clip(jnp.stack(slope), -most, most))

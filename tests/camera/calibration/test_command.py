@@ -133,7 +133,7 @@ def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
         (("floor.png", "empty.png", *WORDS), "1 usable views"),
         (("floor.png",), "--board is missing"),
         (("floor.png", *WORDS[:4]), "--marker is missing"),
-        (("--camera", "c.json"), "alone; expected --floor"),
+        (("--camera", "c.json"), "nothing to determine the pose; expected --floor"),
         (("floor.png", "--camera", "c.json"), "either pictures"),
         (("--camera", "c.json", "--floor", "small.png", *WORDS), "320 x 240 .*640 x 480"),
         (("--camera", "c.json", "--floor", "floor.png", "--points", "p.csv"), "one of them"),

@@ -140,7 +140,7 @@ def numbers(*paths):
         ({"headings_deg": (30.0,)}, ["robot.load_share@as_built"], "in other directions than 30"),
         ({}, ["robot.load_share@as_built"], "weigh each wheel"),
         ({"slip": (0.0, 0.01)}, ["surface.soft.creep"], "slip by 1.0% at most"),
-        ({}, ["camera.scale", "robot.wheel_radius"], "a length in the camera's picture"),
+        ({}, ["camera.scale", "robot.wheel_radius"], "a length in the camera's image"),
         ({}, ["camera.scale", "surface.soft.creep"], "a floor on which the wheels do not slip"),
         ({"speeds": (0.1,)}, ["motor.coulomb_friction", "motor.viscous_friction"], "other speeds"),
     ],
@@ -203,7 +203,7 @@ def test_nothing_determines_the_unit_of_length():
     assert set(found.paths) == {"camera.scale", "robot.wheel_radius", "robot.base_radius"}
     assert found.powers == pytest.approx([1.0] * 3, abs=0.05)
     assert "only as robot.base_radius/robot.wheel_radius" in found.formula
-    assert "a length in the camera's picture" in found.remedy
+    assert "a length in the camera's image" in found.remedy
     by = {e.path: e for e in derived(space, space.start, cov, True)}
     assert by["camera.scale/robot.wheel_radius"].verdict == "identified"
     assert flat_directions(*expected_posterior("camera.scale", *lengths[2:]), True, True) == ()
@@ -240,7 +240,7 @@ def test_the_torque_scale_is_open_without_voltage_and_reported_once():
     free = ("motor.resistance", "motor.back_emf", "motor.*_friction", "surface.*.friction")
     found = flat_directions(*expected_posterior(*free, voltage=False), True, False)
     texts = sentences(found)
-    assert f"the data hardly determine motor.resistance: {VOLTAGE}" in texts
+    assert f"the data have almost no information about motor.resistance: {VOLTAGE}" in texts
     [scale] = [f for f in found if "motor.back_emf" in f.paths]
     assert scale.powers == pytest.approx([1.0] * 5, abs=0.05)
     assert scale.text.endswith(
@@ -416,10 +416,10 @@ def test_a_profile_of_a_number_without_data_is_level():
     [
         ("motor.resistanse", "no parameter 'motor.resistanse'"),
         ("robot.mass", "robot.mass is fixed"),
-        ("robot.load_share@as_built", "has 3 numbers"),
+        ("robot.load_share@as_built", "is a vector of 3 numbers"),
     ],
 )
 def test_a_profile_of_something_else_is_refused_with_the_choices(path, why):
     with pytest.raises(ValueError, match=why) as error:
         profiled(space_of("motor.resistance", "robot.load_share@*"), path)
-    assert str(error.value).endswith("expected one free number: motor.resistance")
+    assert str(error.value).endswith("expected one of the free scalars motor.resistance")

@@ -55,7 +55,7 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
         (GOOD, True, [number(value=4e4)], "not to be trusted", "motor.resistance = 4e+04 ohm"),
         (GOOD, True, [number(verdict="at_bound")], "doubtful", "is at its bound"),
         (GOOD, True, 3 * [number("a", 1.0, "at_bound")], "not to be trusted", "at their bounds"),
-        (GOOD, True, [number(verdict="not_identified")], "doubtful", "none of its numbers"),
+        (GOOD, True, [number(verdict="not_identified")], "doubtful", "no parameter of the fit"),
         (GOOD, True, [number("surface.gray.friction", 40.0)], "not to be trusted", "0.005 to 5"),
     ],
 )

@@ -56,7 +56,7 @@ def test_wheels_that_cannot_drive_and_robots_that_cannot_be_steered_are_refused(
     ways, radius = np.radians([90.0, 210.0, 330.0]), np.full(3, 0.04)
     with pytest.raises(ValueError, match="wheel 2: rollers at 181 deg"):
         inverse_kinematics(place, ways, np.radians([90.0, 181.0, 90.0]), radius)
-    with pytest.raises(ValueError, match="leave a motion of the body free"):
+    with pytest.raises(ValueError, match="do not determine the motion of the body"):
         inverse_kinematics(place, np.zeros(3), np.full(3, 0.5 * np.pi), radius)
 
 

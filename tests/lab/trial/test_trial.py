@@ -501,7 +501,7 @@ def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
 def test_impossible_trials_are_refused(tmp_path, deployed):
     with pytest.raises(DataError, match="expected testsite or twin"):
         tr._tasks(tmp_path, tr.TrialOptions(plant="moon"))
-    with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
+    with pytest.raises(DataError, match="no controller 'magic'; expected one of encoder"):
         tr._tasks(tmp_path, tr.TrialOptions(controllers=("magic",)))
     with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
         refuse_unknown_to_site(uniform("gray"), "as_built", 3)
@@ -509,7 +509,7 @@ def test_impossible_trials_are_refused(tmp_path, deployed):
         refuse_unknown_to_site(uniform("firm"), "far", 3)
     with pytest.raises(DataError, match="has 3 wheels, the fit's 4"):
         refuse_unknown_to_site(uniform("firm"), "as_built", 4)
-    with pytest.raises(DataError, match="no controller; expected some of encoder"):
+    with pytest.raises(DataError, match="no controller; expected one of encoder"):
         tr._tasks(tmp_path, tr.TrialOptions(controllers=tr.controller_names(",")))
     assert tr.controller_names("contact, encoder,contact") == ("contact", "encoder")
     with pytest.raises(DataError, match="no path 'square'; expected one of rectangle, circle"):
@@ -607,7 +607,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
     assert "tuned for load set-up far: driving with hand-set gains" in unused_gains(other, False)
     with pytest.raises(DataError, match=r"another load set-up \(far\), not for as_built; omit"):
         check_gains(tmp_path, other)
-    with pytest.raises(DataError, match="it has no tuned gains; omit --tuned-gains"):
+    with pytest.raises(DataError, match="the robot has no tuned gains; omit --tuned-gains"):
         check_gains(tmp_path, deployed)
 
 

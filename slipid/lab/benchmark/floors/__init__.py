@@ -1,1 +1,1 @@
-"""Floor classification from wheel speeds, currents and a gyro: slipid's filter and others."""
+"""Floor classification from wheel speeds, currents and a gyro: slipid's and published methods."""

@@ -1,27 +1,30 @@
-"""Fit of each floor's force balance parameters to currents and yaw rates alone, without a pose.
+"""Fit of each floor's force balance parameters to currents and yaw rates only, without a pose.
 
 Rows of one run at the same wheel speeds form one cell: accelerations, which are not modelled,
 cancel in its mean. For every floor, the fit solves
 
-    min  sum_cells w_c^2 rho( ((I(w_c) - I_c) / 1 A)^2 + ((W(w_c) - gyro_c) / 0.2 rad/s)^2 ) + prior
+    min  sum_c sum_k rho(a_c ((I_k(w_c) - I_ck) / 1 A)^2)
+         + sum_c rho(a_c g_c ((W(w_c) - W_c) / 0.2 rad/s)^2) + prior
 
-over the logarithms of friction, creep and rolling resistance. w_c are the wheel speeds of cell c,
-I_c and gyro_c its mean currents and yaw rate, I(w) and W(w) the ammeter readings (`MeteredMotor`)
-and the yaw rate that the model predicts in equilibrium at the wheel speeds w, w_c^2 the weight of
-the cell and rho a soft absolute value. Currents are correlated for seconds and differ from run to
-run. A cell of n rows therefore has a weight proportional to n / (1 + n / 20), and the weight of a
-whole run saturates above `RUN_ROWS` rows.
+over the logarithms of friction, creep and rolling resistance. Cell c has the wheel speeds w_c, the
+mean current I_ck of each motor k, the mean yaw rate W_c, the weight a_c, and a yaw rate in the
+fraction g_c of its rows. I_k(w) and W(w) are the ammeter readings (`MeteredMotor`) and the yaw rate
+that the model predicts in equilibrium at the wheel speeds w, and rho(z) = 2 (sqrt(1 + z) - 1) is a
+soft absolute value. Currents are correlated for seconds and differ from run to run. A cell of n
+rows therefore has a weight proportional to n / (1 + n / 20), and the weight of a whole run
+saturates above `RUN_ROWS` rows.
 
 Ammeters. The Husky's ammeters measure the current that a motor takes from the battery. If the floor
-pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter shows zero. Within
-a row the current scatters, so the mean reading is that of a clipped normal variable,
+pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter shows zero. At
+constant wheel speeds the current scatters, so the mean reading is that of a clipped normal
+variable,
 
     E[max(I + n, 0)] = I Phi(I / s) + s phi(I / s),   n ~ N(0, s^2)
 
 with I the motor's current, positive when it drives its wheel's motion, s the standard deviation of
 the scatter, and Phi and phi the standard normal distribution function and density. The motor of one
-side may be stiffer than that of the other; its excess over the mean current of all motors counts as
-its own friction.
+side may have more friction than the motor of the other; its current above the mean of all motors is
+modelled as the motor's own friction.
 """
 
 from collections.abc import Sequence
@@ -48,7 +51,8 @@ CURRENT_A, YAW_RATE = 1.0, 0.2
 CELL_ROWS, RUN_ROWS = 20.0, 300.0
 """Numbers of rows, in one cell and in one run, above which more rows add little weight."""
 FLOOR_CELLS = 512
-"""Largest number of cells of a floor; fewer are padded to it, so that one shape is compiled."""
+"""Largest number of cells of a floor. Smaller numbers are padded to this one, so that functions are
+compiled for a single array size."""
 SPEED_STEP = 1e-3
 """Width to which wheel speeds are rounded; rows with equal rounded speeds are one cell [rad/s]."""
 
@@ -61,7 +65,7 @@ class Cells:
         speed: wheel speed of each drive [rad/s].
         current: current of each motor [A].
         gyro: yaw rate [rad/s], 0 where it is missing.
-        weight: factor of the cell's residuals, of its currents and of its yaw rate.
+        weight: factors of the cell's residuals: first for its currents, then for its yaw rate.
         std: standard deviation of the currents in the cell [A].
         rows: number of rows in the cell.
     """
@@ -166,8 +170,8 @@ def currents_off(
 ) -> Float[np.ndarray, "row drive"]:
     """Return modelled less measured current of each row and drive on a floor [A].
 
-    Rows are evaluated in groups of `FLOOR_CELLS`, the last one padded, so that one shape is
-    compiled.
+    Rows are evaluated in groups of `FLOOR_CELLS`, the last group padded, so that the model is
+    compiled for a single array size.
     """
     groups = -(-len(speed) // FLOOR_CELLS)
     padded = np.zeros((groups * FLOOR_CELLS, speed.shape[1]))
@@ -240,7 +244,7 @@ class MeteredMotor(Motor):
 
     @classmethod
     def of(cls, motor: Motor, stiffness: Array, scatter: Array) -> "MeteredMotor":
-        """Return a motor with its ammeter, given the two attributes of this class [A]."""
+        """Return `motor` with an ammeter of this stiffness and scatter [A]."""
         same = {f.name: getattr(motor, f.name) for f in fields(Motor)}
         return cls(**same, stiffness=stiffness, scatter=scatter)
 

@@ -1,8 +1,8 @@
 """Floor classification on the data set `borealtc`: a Husky on five floors, without a pose.
 
 The robot is described by data of its manufacturer and by measurements of its motors and ammeters.
-Without a pose the torque constant is not identified: frictions scale with the assumed constant, and
-only ratios of frictions of different floors are meaningful.
+Without a pose the torque constant is not identified: friction coefficients scale with the assumed
+constant, and only their ratios between floors are meaningful.
 
 Logs have a folder per floor with a CSV file per run.
 """

@@ -36,7 +36,7 @@ from slipid.support.jax_setup import setup_jax
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Times from the start of a stretch after which answers are evaluated [s]."""
 QUICK_SECONDS = (0.5, 1.0, 2.0)
-"""These times in a quick evaluation [s]."""
+"""Times from the start of a stretch after which a quick evaluation reads answers [s]."""
 CLASSIFIER_FOLDS, CLASSIFIER_INNER_FOLDS = 5, 2
 """Numbers of folds: of the evaluation, and of the inner cross-validation that selects settings."""
 
@@ -154,7 +154,7 @@ def evaluated(
     spec: RobotSpec,
     settings: EvaluationSettings,
 ) -> FoldScore[Answer]:
-    """Return a classifier's answers in one fold: tuned, fitted and applied to the held-out runs."""
+    """Tune and fit a classifier on training runs, and return its answers on held-out runs."""
     began = time.perf_counter()
     found = tuned_classifier(method, training, spec, settings)
     tuned = time.perf_counter()
@@ -173,10 +173,10 @@ def evaluated(
 
 
 def attempted(work: Callable[[], FoldScore[Answer]]) -> FoldScore[Answer]:
-    """Return the result of `work()`; if it raises, an empty one with the reason."""
+    """Return the result of `work()`; if it raises, an empty `FoldScore` with the reason."""
     try:
         return work()
-    except Exception as error:  # A row that fails does not stop the evaluation of the others.
+    except Exception as error:  # the other classifiers are evaluated even if one fails
         return FoldScore.of_error(error)
 
 
@@ -291,7 +291,7 @@ class FloorTask(abc.ABC):
         if found is None or "failed" in found or any(row["absent"] for row in found["rows"]):
             try:
                 kept.save_json(self.name, self.make())
-            except Exception as error:  # A task that fails does not stop the others.
+            except Exception as error:  # the other tasks run even if this one fails
                 kept.save_json(self.name, {"failed": FoldScore.of_error(error).absent})
         return self.name
 

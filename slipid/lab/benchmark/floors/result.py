@@ -35,7 +35,7 @@ Accuracies = Content
 - stretches: number of stretches.
 - accuracy: fraction of the stretches in which the most probable floor is the true one.
 - balanced: mean over floors of the accuracy on each floor.
-- behind: accuracy less that of slipid on the same resampled runs; None for slipid itself.
+- behind: accuracy minus that of slipid, on the same resampled runs; None for slipid itself.
 - by_floor: accuracy on each floor.
 - log_score: mean natural logarithm of the probability of the true floor; 0 is best, and equal
   probabilities of n floors give log(1 / n).
@@ -79,7 +79,7 @@ def after_seconds(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> 
 def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> Accuracies:
     """Return the accuracy from answers that were all read after the same time."""
     right = np.array([a.named == a.floor for a in answers], dtype=float)
-    # whole runs are resampled, floor by floor
+    # resample whole runs, since the stretches of one run are correlated
     run = np.unique([a.run for a in answers], return_inverse=True)[1]
     by = Bootstrap.by([a.floor for a in answers], run)
     behind = None
@@ -99,7 +99,10 @@ def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> Accurac
 
 
 def confusion(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:
-    """Return the fraction of answers that name each floor, by true floor, after `seconds` s [%]."""
+    """Return `table[true][named]` [%]: of the answers on a true floor, how many name each floor.
+
+    Only answers after `seconds` [s] are counted.
+    """
     mine = [a for a in answers if a.seconds == seconds]
     names = sorted({a.floor for a in mine} | {a.named for a in mine})
     table: dict[str, dict[str, float]] = {}

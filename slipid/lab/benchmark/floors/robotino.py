@@ -44,9 +44,9 @@ def robotino_classifiers() -> list[FloorClassifier]:
 
 
 def robotino_table(options: BenchmarkOptions) -> ClassifierTable:
-    """Return the table of all classifiers on the Robotino's runs, or of the requested ones.
+    """Return the table of all classifiers, or of those requested, on the Robotino's runs.
 
-    A fit of slipid to the same runs that is saved in a checkpoint is reused.
+    If a checkpoint has a fit of slipid to the same runs, the fit is reused.
     """
     data = data_of(options, SOURCE)
     inner = 1 if options.quick else 2

@@ -6,7 +6,7 @@ gyro. Besides the parameters of the floors it is given
 - a model of the ammeters, which read zero for braking motors
   (`slipid.lab.benchmark.floors.fitting`);
 - the scatter of currents on each floor, separately for straight motion, bends and turning on the
-  spot, which follow from the wheel speeds;
+  spot (`kinds` finds the kind of motion from the wheel speeds);
 - settings under which all wheels are on one floor that does not change.
 
 At the first row of a run, the filter starts with the measured wheel speeds, not from rest.
@@ -86,14 +86,15 @@ BEND_RATIOS = (0.17, 0.45)
 v is the velocity [m/s], W the yaw rate [rad/s] of the rolling wheels, and L the base radius [m].
 """
 RUNS_PER_CALL = 64
-"""Number of runs in one call of the filter; fewer are padded, so that one shape is compiled."""
+"""Number of runs in one call of the filter. Smaller numbers are padded, so that the filter is
+compiled for a single array size."""
 SHARED_ROWS = 20.0
-"""Weight, in rows, of a floor's mean squared residual in that of each kind of motion on it.
-
-It acts as a prior where a kind of motion has few rows.
+"""Weight [rows] of the mean squared residual over all motion on a floor, when it is combined with
+the squared residuals of one kind of motion there. It acts as a prior for kinds with few rows.
 """
 MOST_ROWS = 150
-"""Target number of rows of a run for the scatter of currents; longer runs are thinned to about it.
+"""Approximate number of rows per run from which the scatter of currents is computed; longer runs
+are thinned.
 """
 SETTINGS = Settings(
     current_is_signed=False,
@@ -143,7 +144,7 @@ class SlipidFloorClassifier(FloorClassifier):
 
     def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
-            raise ValueError(f"{self.name} was not fitted")
+            raise ValueError(f"{self.name} was not fitted; expected a call of `fit` before")
         plain = deployed(self._on(self.labels))
         robot = replace(plain, floors=self.fitted.surfaces, motor=self.fitted.motor)
         estimator = Estimator(robot, self.settings)
@@ -168,10 +169,11 @@ class SlipidFloorClassifier(FloorClassifier):
     def _on(self, labels: tuple[str, ...]) -> Robot:
         """Return the robot on the named floors with parameters that are not yet fitted."""
         if self.robot is None:
-            raise ValueError(f"{self.name}: no robot was given")
+            raise ValueError(f"{self.name}: no robot was given; expected the argument `robot`")
         robot = self.robot.on(labels)
         none = jnp.zeros(len(labels))
-        # lead and load exponent of the drag describe soft floors under omni wheels: no effect here
+        # switch off the lead and the load exponent of the drag, which describe soft floors under
+        # omni wheels
         surfaces = replace(robot.surfaces, lead=none, drag_exponent=none + 1.0)
         return replace(robot, surfaces=surfaces)
 

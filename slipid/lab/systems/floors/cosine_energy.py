@@ -14,8 +14,8 @@ p_t is the probability of a floor after row t, dt the duration of the row, and `
 are the times of `accumulated`. s is the std of a floor's residuals from its series. A robot that
 cannot drive sideways always travels ahead or back; phi is then the angle of (v_x, L W), where 0 is
 straight ahead and a right angle is turning on the spot. Tuned by cross-validation: whether the heat
-R I^2 is part of P, without which e depends on currents and the ratio of speeds alone, and whether e
-or its logarithm is modelled.
+R I^2 is part of P (without the heat, e depends only on the currents and on ratios of speeds), and
+whether e or its logarithm is modelled.
 
 Liberties
 - Only the abstract and the headings of the paper were available: they name an energy coefficient of
@@ -58,7 +58,8 @@ from slipid.model.robot import GRAVITY
 from slipid.predict.slip_model import RobotSpec
 
 LEAST_SPEED = 0.02
-"""Largest speed u of rows that are not used, since their direction of travel is undefined [m/s]."""
+"""Rows with a speed u up to this are not used, since their direction of travel is undefined [m/s].
+"""
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class CosineEnergyClassifier(FloorClassifier):
 
     def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if not self.labels:
-            raise ValueError(f"{self.name} was not fitted")
+            raise ValueError(f"{self.name} was not fitted; expected a call of `fit` before")
         out = []
         for run in runs:
             angle, energy = self._direction_and_energy(run, spec).T

@@ -234,7 +234,7 @@ class TrailingWindow:
         seconds: float,
         start: Int[np.ndarray, " row"] | None = None,
     ) -> "TrailingWindow":
-        """Return windows of `seconds` [s] for rows at times `time` [s], no row before `start`."""
+        """Return windows of `seconds` [s] for rows at times `time` [s], cut off at rows `start`."""
         first = np.searchsorted(time, time - seconds + 1e-6)
         return cls(first if start is None else np.maximum(first, start))
 

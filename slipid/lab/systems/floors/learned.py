@@ -27,14 +27,15 @@ decision trees each of which is fitted to the residuals of those before it; P(fl
 frequency of a floor in the training rows. Tuned by cross-validation: leaves per tree.
 
 Trees also learn the driving style on each floor: if the robot drove fast on asphalt only, a high
-speed means asphalt whatever the motor currents are. Two more rows show how much that contributes.
-`boosted_trees_driving` uses the wheel speeds alone. `boosted_trees_felt` removes the driving style,
+speed means asphalt whatever the motor currents are. Two more rows show how much the driving style
+contributes. `boosted_trees_driving` uses only the wheel speeds. `boosted_trees_felt` removes the
+driving style,
 
-    log l_t = log P(floor | x_t) - log P(floor | features of the wheel speeds alone)
+    log l_t = log P(floor | x_t) - log P(floor | features of the wheel speeds only)
 
-which is the likelihood of currents and turning given the wheel speeds, up to a factor: the quantity
-that a model of the robot provides. `boosted_trees_vibration` also uses the acceleration, which
-slipid does not.
+so that l_t is the likelihood of currents and turning given the wheel speeds, up to a factor: the
+quantity that a model of the robot provides. `boosted_trees_vibration` also uses the acceleration,
+which slipid does not.
 
 Liberties of the trees
 - They follow no particular published system; the features are those of
@@ -78,7 +79,7 @@ LogLikelihood = Float[np.ndarray, "row floor"]
 LOWEST_PROBABILITY = 1e-4
 """Lower limit of the probability of a floor in one row."""
 SPEEDS_ONLY: frozenset[FloorChannel] = frozenset()
-"""Wheel speeds alone, to learn floors from the driving style."""
+"""No channel besides the wheel speeds, to learn floors from the driving style."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +151,7 @@ class GaussianClassifier(FloorClassifier):
 
     def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
-            raise ValueError(f"{self.name} was not fitted")
+            raise ValueError(f"{self.name} was not fitted; expected a call of `fit` before")
         logs = [self.fitted.log_likelihood(self._features(run, spec)) for run in runs]
         return [accumulated(log, run, self.apart_s) for log, run in zip(logs, runs, strict=True)]
 
@@ -199,7 +200,7 @@ class BoostedTreesClassifier(FloorClassifier):
 
     Attributes:
         channels: channels of the features.
-        without_driving: True if the log likelihood from wheel speeds alone is subtracted.
+        without_driving: True if the log likelihood from only the wheel speeds is subtracted.
         leaves: largest number of leaves of a tree.
         trees: number of boosting steps, each of which adds one tree per floor.
         rate: learning rate.
@@ -234,7 +235,7 @@ class BoostedTreesClassifier(FloorClassifier):
 
     def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if not self.fitted:
-            raise ValueError(f"{self.name} was not fitted")
+            raise ValueError(f"{self.name} was not fitted; expected a call of `fit` before")
         log = self.fitted[0].log_likelihood(runs, spec)
         for other in self.fitted[1:]:
             log = log - other.log_likelihood(runs, spec)

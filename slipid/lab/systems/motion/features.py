@@ -11,9 +11,9 @@ The target is the slip ratio of the body,
 
     ratio = (true twist - rolling twist) (1, 1, L) / size
 
-It has no unit, and where friction does not depend on the speed it depends little on it, so that a
-fit at one speed also holds at others, unlike a fit of a target in m/s. The noise of the pose is
-divided by the size too, so windows are weighted by
+This ratio has no unit. Where friction does not depend on the speed, the ratio depends little on the
+speed, so that a fit at one speed also holds at other speeds, unlike a fit of a target in m/s. The
+noise of the pose is divided by the size too, so windows are weighted by
 
     weight ~ size^2 / (size^2 + (median size / 2)^2)
 
@@ -125,7 +125,10 @@ class SignalWindows:
         """Return the values of a channel in all windows; ValueError if a run lacks it."""
         for run in self.signals:
             if getattr(run, name) is None:
-                raise ValueError(f"{run.name}: no {name}, but the training runs have one")
+                raise ValueError(
+                    f"{run.name}: no {name}, but the training runs have one; expected it in every "
+                    "run"
+                )
         return np.concatenate([getattr(run, name) for run in self.signals])
 
 
@@ -230,7 +233,7 @@ class Scale:
     def of(cls, x: Float[np.ndarray, "row column"]) -> "Scale":
         """Return the standardisation of the columns of these training rows."""
         std = x.std(axis=0)
-        # The computed std of a constant column is not zero but of the size of rounding errors.
+        # compare with a tolerance: rounding errors make the std of a constant column nonzero
         flat = std <= 1e-9 * np.abs(x).max(axis=0)
         return cls(x.mean(axis=0), np.where(flat, 1.0, std), x.min(axis=0), x.max(axis=0))
 
@@ -239,7 +242,7 @@ class Scale:
         return np.asarray((x.clip(self.low, self.high) - self.mean) / self.std)
 
     def back(self, x: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
-        """Return the values, in their original units and range, of standardised values."""
+        """Return standardised values in original units, clipped to the training range."""
         return np.asarray((x * self.std + self.mean).clip(self.low, self.high))
 
 

@@ -4,8 +4,8 @@
     mean(x) = k(x, X) (K + noise I)^-1 y
     var(x) = k(x, x) + noise - k(x, X) (K + noise I)^-1 k(X, x)
 
-X are the training inputs, y their outputs and K = k(X, X). All outputs share one kernel, each in
-units of its own standard deviation. Hyperparameters maximise the marginal likelihood of
+X are the training inputs, y their outputs and K = k(X, X). All outputs, each divided by its
+standard deviation, share one kernel. Hyperparameters maximise the marginal likelihood of
 `MOST_TUNING_WINDOWS` windows, in at most `OPTIMISER_STEPS` steps from one start point; the
 posterior is conditioned on `MOST_WINDOWS` windows. Windows are drawn in proportion to their weight,
 with a fixed seed.
@@ -89,7 +89,7 @@ class ProcessRows:
         from sklearn.exceptions import ConvergenceWarning
 
         with warnings.catch_warnings():
-            # A length scale at its upper bound only means that its input is irrelevant.
+            # do not warn of a length scale at its upper bound: its input is merely irrelevant
             warnings.simplefilter("ignore", ConvergenceWarning)
             return self._fitted(kernel, MOST_TUNING_WINDOWS, _few_steps).kernel_
 
@@ -118,7 +118,8 @@ def _few_steps(
 ) -> tuple[Float[np.ndarray, " log"], float]:
     """Return the minimiser and the loss after at most `OPTIMISER_STEPS` steps of L-BFGS-B.
 
-    It is an optimiser in scikit-learn's form; the variables are logarithms of hyperparameters.
+    The function has the signature that scikit-learn expects of an optimiser. Its variables are
+    logarithms of hyperparameters.
     """
     from scipy.optimize import minimize
 

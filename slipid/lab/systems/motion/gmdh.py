@@ -23,7 +23,8 @@ Liberties:
       in the networks of the classifier.
     - Evidence about the floor is accumulated along the run and fades, since a run may cross floors.
       The reported floor probabilities always come from the signals, even if the floor is given.
-    - The robot knows its load set-up: floors without training runs with it have probability zero.
+    - The robot knows its load set-up: floors without training runs in this set-up have probability
+      zero.
     - Twenty neurons of a layer are kept, and the next layer has only their outputs as inputs.
 
 Source: Andrakhanov, Belyaev 2017, Navigation learning system for mobile robot in heterogeneous
@@ -55,7 +56,8 @@ from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, Run
 KEPT_NEURONS = 20
 """Number of neurons of a layer whose outputs are the inputs of the next layer."""
 LOWEST_OUTPUT = 0.05
-"""Lower limit of the classifier's output for a floor in one window, which may be negative."""
+"""Lower limit to which the classifier's possibly negative output for a floor and window is raised.
+"""
 EVIDENCE_MEMORY = 0.9
 """Factor by which evidence about the floor fades from window to window."""
 CANDIDATES = (
@@ -160,7 +162,7 @@ class GmdhClass(SlipModel):
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhClass":
         data = SlipExamples.of(runs, spec)
         in_a = first_half(data.run, data.floor)
-        # A floor on which no wheel turned has no training windows.
+        # list the floors of windows, not of runs: a floor on which no wheel turned has no window
         names = list(dict.fromkeys(data.floor.tolist()))
         on = np.stack([data.floor == name for name in names], axis=1)
         floors = {
@@ -208,7 +210,7 @@ class GmdhClass(SlipModel):
             return np.ones((len(inputs), 1))
         share = self.classifier.predict(inputs).clip(min=LOWEST_OUTPUT)
         evidence = np.log(share / share.sum(axis=1, keepdims=True))
-        # Signals of a robot at rest contain no evidence about its floor.
+        # ignore windows at rest, whose signals contain no evidence about the floor
         evidence[~windows.moving] = 0.0
         possible = np.array([[run.load in loads for loads in self.loads] for run in runs])
         possible |= ~possible.any(axis=1, keepdims=True)

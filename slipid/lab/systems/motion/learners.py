@@ -30,8 +30,8 @@ random and held out.
 Tuned: size of the one hidden layer, and alpha.
 
 Liberties of the network:
-    - It is not one published network: those in the literature differ in inputs and sizes from robot
-      to robot, and this is what they have in common.
+    - It is not one published network: networks in the literature differ in inputs and sizes from
+      robot to robot, and the form above is what they have in common.
     - Inputs and outputs are clipped to the training range.
     - Windows held out for early stopping are neighbours of training windows.
 

@@ -13,8 +13,8 @@ to a floor, are shared by all wheels, and are fitted in one of three ways:
                        of each segment, here each run, relative to its start
     ojeda_gyro         no pose: least squares in the encoders' yaw rate less the gyro's
 
-The hard floor is the one among the training floors on which encoders have the smallest errors. The
-threshold for slip comes from the currents on it and is used on all floors. If all training runs are
+The hard floor is the training floor on which encoders have the smallest errors. The threshold for
+slip comes from the currents on the hard floor and is used on all floors. If all training runs are
 on one floor, the quarter of the runs with the smallest encoder errors takes the place of a hard
 floor; little slip is flagged then.
 
@@ -68,8 +68,8 @@ Tuning = Literal["continuous", "sporadic", "gyro"]
 FORGETTING = 0.995
 """Factor by which the weight of a window falls with each later window."""
 SLIP_SIGMAS = 3.0
-"""Slip is flagged if the mean current exceeds the hard floor's mean by this many std of the latter.
-"""
+"""Slip is flagged if the wheels' mean current exceeds its mean on the hard floor by more than this
+multiple of its standard deviation there."""
 LEAST_RIM_SPEED = 0.02
 """Mean rim speed above which the robot counts as moving [m/s]."""
 PRIOR_VARIANCE = 1e6
@@ -131,7 +131,7 @@ class Ojeda(SlipModel):
         tuning: one of the three ways to fit k0 and k1.
         time_constant: time constant of the low pass [s].
         hard: currents on the hard floor; None before a fit.
-        lines: k0 and k1 of each floor; those under None are for unknown floors.
+        lines: k0 and k1 keyed by floor; the pair under the key None is for unknown floors.
     """
 
     tuning: Tuning = "continuous"
@@ -153,7 +153,7 @@ class Ojeda(SlipModel):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.hard is None:
-            raise ValueError(f"{self.name}: not fitted")
+            raise ValueError(f"{self.name} was not fitted; expected a call of fit before predict")
         flagged = self._flagged(runs, self.hard, spec)
         line = np.stack([self.lines.get(run.floor, self.lines[None]) for run in runs])
         twist = flagged.twist(np.repeat(line, flagged.steps.length, axis=0), spec)
@@ -249,14 +249,14 @@ def sporadic(steps: FlaggedSteps, runs: Sequence[Run], spec: RobotSpec) -> Line:
 
 
 def by_gyro(steps: FlaggedSteps, w: TrainingWindows, middle: float, spec: RobotSpec) -> Line:
-    """Return k0 and k1 fitted to yaw rates alone; `middle` is the hard floor's mean current [A].
+    """Return k0 and k1 fitted only to yaw rates; `middle` is the hard floor's mean current [A].
 
     Raises:
         ValueError: the signals have no gyro.
     """
     signals = steps.steps.signals
     if signals.gyro is None:
-        raise ValueError(f"{signals.name}: no gyro; expected one, which this method needs")
+        raise ValueError(f"{signals.name}: no gyro; expected a logged gyro for this method")
     parts = w.means(spec.back[2] @ steps.features(middle)) * w.dt[:, None]
     gap = w.means(signals.rolling(spec)[:, 2] - signals.gyro) * w.dt
     offset, gain = scaled_least_squares(parts, gap)

@@ -28,7 +28,8 @@ POWERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [2, 0], [0, 2]])
 LEAST_GAIN = 1e-3
 """Smallest relative decrease of the mean square error on B by a new layer; less may be chance."""
 ROUNDING = 1e-12
-"""A mean square error on B up to this is taken as rounding error, for outputs of variance one."""
+"""Mean square error on B up to which growth stops, since it may be rounding error, for outputs of
+variance one."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 In `quann_energy` the energy per metre  y = P / max(|v|, 0.02)  [J/m] is a linear function of
 (1, |v|, |v|^2, |W|) plus a Gaussian process over the position. P is the electric power [W], v the
-velocity [m/s] and W the yaw rate [rad/s] of the rolling wheels. Power is predicted from encoders
-alone as y max(|v|, 0.02).
+velocity [m/s] and W the yaw rate [rad/s] of the rolling wheels. Power is predicted only from
+encoders, as y max(|v|, 0.02).
 
 One setting is tuned by the energy error of whole runs: the length scale of the map.
 
@@ -86,7 +86,7 @@ if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
 
 LEAST_SPEED = 0.02
-"""Lower limit of |v| in the energy per metre, which is proportional to power below it [m/s]."""
+"""Lower limit of |v| by which power is divided to get the energy per metre [m/s]."""
 
 
 @final
@@ -164,7 +164,8 @@ def places(windows: SignalWindows, spec: RobotSpec) -> Float[np.ndarray, "window
 
 
 INFLATION_PARTS = 4
-"""Number of parts of the runs; to find the inflation, a fit to the others predicts each part."""
+"""Number of parts into which runs are divided to find the inflation: each part is predicted by a
+fit to the other parts."""
 START_LENGTH = 2.0
 """Initial length scale of every input, in standard deviations of the input."""
 CAMERA_STD = 1e-3

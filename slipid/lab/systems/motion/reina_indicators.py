@@ -74,7 +74,8 @@ class Sugeno:
 
 
 SLIP_THRESHOLD = 0.2
-"""Difference of true and encoders' twist, relative to the latter, above which a window slips."""
+"""A window slips if the true twist differs from the encoders' by more than this fraction of the
+latter."""
 _REST = 0.01
 """Largest speed of the fastest rim at which a robot counts as at rest [m/s]."""
 _DRIVING = 0.3
@@ -86,7 +87,7 @@ class SmoothedSignals:
     """Smoothed signals in every step of a run, from which the indicators are computed.
 
     Attributes:
-        deviation: largest deviation of a wheel's speed from its reference, relative to that.
+        deviation: largest deviation of a wheel's speed from its reference, divided by the latter.
         change: largest magnitude of a wheel's acceleration [rad/s^2].
         turning: magnitude of the difference of the yaw rates from encoders and gyro [rad/s]; None
             without a gyro.

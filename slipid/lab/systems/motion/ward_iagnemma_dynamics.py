@@ -233,7 +233,7 @@ class PaddedRuns:
 
 
 def measurements(run: RunSignals, spec: RobotSpec) -> tuple[np.ndarray, ...]:
-    """Return the arrays of one run that `PaddedRuns` has of several, in the same order."""
+    """Return the fields of `PaddedRuns` for one run, without padding, in the same order."""
     gyro = np.full(len(run), np.nan) if run.gyro is None else run.gyro
     rim, rolling = run.speed * spec.wheel_radius, run.rolling(spec) * spec.size
     return run.dt, rim, rolling, gyro, motor_forces(run, spec)

@@ -133,7 +133,7 @@ class SlipFilter:
         by = np.tile(np.eye(8), (len(dt), 1, 1))
         by[:, :3, :3], by[:, :3, 3] = step.by_speeds, step.by_rolling
         after = state.moved(np.concatenate([step.speeds, state.mean[:, 3:]], axis=1), by)
-        # noise of the twist, white over steps, whose integral over a second has the std `drift`
+        # add noise to the twist, white over steps, whose integral over a second has the std `drift`
         rate = np.where(dt > 0.0, 1.0 / np.where(dt > 0.0, dt, 1.0), 0.0)[:, None]
         after.covariance[:, range(3), range(3)] += np.square(self.noise.drift) * rate
         after.covariance[:, 3, 3] += self.wander**2 * dt
@@ -182,7 +182,8 @@ class SlipFilter:
         aside = turning[:, ::-1] * [-1.0, 1.0]
         x, y, yaw = state.mean[:, 0:1], state.mean[:, 1:2], state.mean[:, 2:3] / radius
         along, across = x * turning + y * aside, x * aside - y * turning
-        # chord of the step's arc per speed, as in `path_of`, and how it shortens with the turn
+        # `reach`: chord of the step's arc over the speed, as in `path_of`; `less`: minus its
+        # derivative with respect to the yaw rate, to first order
         wait = dt[:, None]
         reach, less = np.sinc(yaw * wait / (2 * np.pi)) * wait, yaw * wait**3 / 12
         by = np.tile(np.eye(8), (len(dt), 1, 1))
