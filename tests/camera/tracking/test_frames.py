@@ -194,7 +194,7 @@ def test_a_folder_without_pictures(tmp_path):
 def test_a_device_needs_an_end_and_has_its_own_times():
     with pytest.raises(DataError, match="expected --seconds with the recording's duration"):
         open_source("0")
-    with pytest.raises(DataError, match="--fps or --times is given, but .* omit both"):
+    with pytest.raises(DataError, match=r"--fps or --times is given, but .* omit both"):
         open_source("/dev/video7", fps=30.0, seconds=1.0)
     with pytest.raises(DataError, match="--seconds is for devices"):
         open_source("a.avi", seconds=1.0)
