@@ -40,8 +40,8 @@ class BenchTask:
     Motors have labels; a single motor has the label "".
 
     Attributes:
-        records: records of each motor, by the motor's label.
-        choices: fixed, free and prior values of each motor's parameters, by the motor's label.
+        records: records of each motor, keyed by the motor's label.
+        choices: fixed, free and prior values of each motor's parameters, keyed by its label.
         skipped: one line about each log that is not used.
         columns_used: for a single file, one line about each channel and the columns assigned to it.
         unit_is_known: True if the unit of the current was given or the config has a choice for the
@@ -83,10 +83,13 @@ def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
             parts += [records_of(log, layout) for log in logs]
     counts = {len(p) for p in parts}
     if len(counts) > 1:
-        raise DataError(f"{config.path}: logs of {min(counts)} and of {max(counts)} motors")
+        raise DataError(
+            f"{config.path}: logs of {min(counts)} and of {max(counts)} motors; expected the same "
+            "number in every log"
+        )
     with_voltage = [p for p in parts if p[0].voltage is not None]
     if without := len(parts) - len(with_voltage) if with_voltage else 0:
-        skipped.append(f"skipped: {without} logs without a voltage, others have one")
+        skipped.append(f"skipped: {without} logs without a voltage, since other logs have one")
         parts = with_voltage
     robot = config.content.robot
     names = robot.names if isinstance(robot, BenchMotors) else []
@@ -107,8 +110,9 @@ def read_motor_log(
 
     Args:
         path: the log file.
-        given: columns that the user named, by channel; other channels are found by column names.
-        delimiter: text between cells, or None to guess it.
+        given: columns that the user named, keyed by channel; other channels are found by their
+            column names.
+        delimiter: character between cells, or None to guess it.
         signed: True if currents have a sign.
 
     Raises:
@@ -169,7 +173,7 @@ def _read(log: Log, motor: int) -> Bool[np.ndarray, " time"]:
 def _by_motor(
     logs: Sequence[Sequence[BenchRecord]], names: Sequence[str], where: Path
 ) -> dict[str, tuple[BenchRecord, ...]]:
-    """Return the records of each motor by its label: its name, or else its number from 1.
+    """Return the records of each motor, keyed by its label: its name, or else its number from 1.
 
     A single motor without a name has the label "". `logs` has a record of each motor in each log,
     and `where` is the file with the names, for messages.

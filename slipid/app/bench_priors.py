@@ -15,13 +15,13 @@ COPY_NAME = "motor_bench.json"
 GEAR_STD = 0.3
 """Std of the change of friction by the robot's gear, relative to the friction on the bench [1]."""
 NAMES = ("resistance", "back_emf", "brush_drop", "coulomb_friction", "viscous_friction")
-"""Names of the parameters taken from a bench. Sensor offsets are not, since they belong to the
-meters of the bench."""
+"""Names of the parameters taken from a bench. Sensor offsets are not taken, since they belong to
+the meters of the bench."""
 _EXPECTED = "what `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
 Identified = dict[str, list[tuple[float, float]]]
-"""Value and std of each motor for which a parameter is identified, by the parameter's name."""
+"""Value and std of a parameter for each motor in which it is identified, keyed by its name."""
 
 
 def bench_of(config: Config) -> tuple[Path, Identified] | None:
@@ -41,10 +41,10 @@ def bench_of(config: Config) -> tuple[Path, Identified] | None:
 
 
 def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[str]]:
-    """Return priors of `motor.*` from a config's bench file, and lines about what was taken.
+    """Return priors of `motor.*` from a config's bench file, and lines about which were taken.
 
     With a gear ratio n, a friction torque at the shaft is n times as large at the wheel, and a
-    friction torque per speed n^2 times.
+    friction torque per speed is n^2 times as large.
 
     Raises:
         DataError: the file is missing, damaged, or not the result of a bench.
@@ -85,7 +85,9 @@ def _read(path: Path, where: str) -> Identified:
     content = read_json(path, _EXPECTED)
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != SCHEMA or content.get("drive") != "motor":
-        found = "a robot's numbers" if schema == SCHEMA else f"schema {schema}"
+        found = (
+            "the parameters of a robot, not of a motor" if schema == SCHEMA else f"schema {schema}"
+        )
         raise DataError(f"{where}: {path}: {found}; expected {_EXPECTED}")
     known: Identified = {}
     try:

@@ -42,16 +42,18 @@ def sanity(task: FitTask) -> tuple[Finding, ...]:
 def _braking(task: FitTask) -> Iterator[Finding]:
     """Yield a finding if unsigned currents and voltages are logged on a robot that scrubs in turns.
 
-    On such a robot some wheels drag others along, which brake. In simulated runs of a skid-steer
-    robot, the resistance was then wrong by ten standard deviations, with the verdict "identified".
+    On such a robot some wheels are dragged along by other wheels and brake. In simulated runs of a
+    skid-steer robot, the resistance was then wrong by ten standard deviations, with the verdict
+    "identified".
     """
     runs = task.dataset
     has = runs.current is not None and runs.voltage is not None
     if has and not runs.current_is_signed and not task.robot.geometry.determines_twist:
         yield Finding(
             "braking_unseen",
-            "currents are magnitudes, and in turns a wheel that is dragged along brakes: taken as "
-            "driving currents beside the voltages, they give a wrong resistance and back-EMF",
+            "currents are magnitudes, and in turns a wheel that is dragged along brakes: its "
+            "current would be taken as a driving current, and with the voltage give a wrong "
+            "resistance and back-EMF",
             "log currents with their sign, or take the voltage out of the layout",
             "wrong",
         )
@@ -108,8 +110,8 @@ class ExpectedEstimates:
     """Estimates that a fit is expected to have, before it is made.
 
     Attributes:
-        parameters: expected estimate of each parameter, by its path.
-        derived: expected estimate of each derived ratio of parameters, by its name.
+        parameters: expected estimate of each parameter, keyed by its path.
+        derived: expected estimate of each derived ratio of parameters, keyed by its name.
         messages: one sentence about each combination of parameters that stays unknown, with a
             measurement that would help.
     """
@@ -140,7 +142,7 @@ def check(
     """
     setup_jax(quiet=True)
     task = read_fit_task(read_config(config_path), data, report)
-    report.stage("do logs and config go together?")
+    report.stage("comparing logs with config")
     content = overview(task, task.skipped)
     report.stage("expected information")
     try:
@@ -229,7 +231,7 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
     most = -np.inf
     starts = (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS))
     covariances = [problem.laplace(z, log_v, keep) for z in starts]
-    # This comes after the covariances, whose compiled functions it shares.
+    # The range of validity comes after the covariances, since it uses their compiled functions.
     robot = space.tree(space.start)
     validity = curves_of.validity(task.dataset, robot, problem.batch)
     where = w.has_current, volt, validity, robot.geometry.determines_twist
@@ -245,7 +247,7 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
 
 
 def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
-    """Replace the kept estimates by those found, wherever these are less informative."""
+    """Replace each kept estimate by the found one of the same path if that is less informative."""
     order = ("identified", "weak", "not_identified")
 
     def promise(e: Estimate) -> tuple[int, float]:

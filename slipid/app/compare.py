@@ -58,11 +58,11 @@ def compare(
     refuse_misordered(task.logs)
     folds_by_question = {name: folds_of(task.dataset, name) for name in dict.fromkeys(questions)}
     for name in [name for name, fold in folds_by_question.items() if (fold < 0).all()]:
-        report.line(f"skipped: {name}: no floor has runs in two of them")
+        report.line(f"skipped: {name}: no floor has runs in two folds")
         del folds_by_question[name]
     if not folds_by_question:
         raise DataError(
-            f"{config.path}: no run can be left out; expected several headings or speeds"
+            f"{config.path}: no run can be held out; expected runs with several headings or speeds"
         )
     report.stage("cutting windows")
     problem = task.problem()
@@ -89,7 +89,7 @@ def _rows(folds: Sequence[Content]) -> list[Content]:
 
 
 def _answer(folds: Sequence[Content]) -> Content:
-    """Return the ranking on each floor under one kind of held-out runs, and what it cost."""
+    """Return the ranking on each floor for one kind of folds, and the cost of each slip model."""
     floors = ranking([ScoredRun.of_json(row) for row in _rows(folds)])
     return {
         "folds": len(folds),
@@ -100,7 +100,7 @@ def _answer(folds: Sequence[Content]) -> Content:
 
 
 def _cost(folds: Sequence[Content]) -> Content:
-    """Return, by slip model, the number of fitted parameters and the times per fold [s].
+    """Return, for each slip model, the number of fitted parameters and the times per fold [s].
 
     The times are those of the fit and of the prediction.
     """
@@ -195,7 +195,9 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Valida
     for sentence in skipped:
         report.line(sentence)
     if again := len(dataset) - fit.new_runs(dataset):
-        report.line(f"{again} of {len(dataset)} runs were fitted: they say little about new ones")
+        report.line(
+            f"{again} of {len(dataset)} runs were fitted: their errors say little about new runs"
+        )
     report.stage("predicting")
     try:
         return fit, dataset, fit.validate(dataset)

@@ -31,9 +31,9 @@ class RunFloors:
         name: name of the run.
         time: time of each row [s].
         pose: pose of the body in the frame of the map: x, y [m], heading [rad].
-        surface: number of the surface under each wheel.
-        border: distance of each wheel from the nearest place with another surface [m].
-        inside: True if each wheel is on the map; if not, its floor is unknown.
+        surface: index of the surface under each wheel in the surfaces of the look-up table.
+        border: distance of each wheel from the nearest point with another surface [m].
+        inside: True for a wheel that is on the map; the floor under other wheels is unknown.
     """
 
     name: str
@@ -131,7 +131,7 @@ def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> li
 
 
 def summary(lookup: FloorLookup, runs: list[RunFloors]) -> Content:
-    """Return the shares of rows in which each wheel was on each floor, for each run."""
+    """Return the fraction of rows in which each wheel was on each floor, for each run."""
     return {
         "schema": SCHEMA,
         "surfaces": list(lookup.surfaces),

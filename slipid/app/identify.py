@@ -69,7 +69,7 @@ def identify(
 ) -> IdentifyResult:
     """Return the fit of a config's robot to its logs, and write all results to `out`.
 
-    If `out` has the checkpoint of the same fit, interrupted before, that fit is continued.
+    If `out` has the checkpoint of the same fit, which was interrupted, the fit resumes from it.
 
     Args:
         config_path: the config.
@@ -77,7 +77,8 @@ def identify(
         out: folder to write to.
         report: reporter of the progress.
         profiles: paths of parameters whose profile likelihood is computed.
-        anyway: True to fit even if logs and config contradict each other, which is reported.
+        anyway: True to fit even if logs and config contradict each other; the contradictions are
+            reported.
 
     Raises:
         DataError: config or logs are wrong; in this case nothing was written.
@@ -109,7 +110,7 @@ def identify(
     written = (*save(fit, out), "run.json", "config.toml")
     _write_run(task, trust, data, out, time.monotonic() - began)
     if profiles and task.mixed:
-        report.line("profiles are of the runs on one floor each")
+        report.line("profiles use only the runs on one floor each")
 
     def tell(points: int, rise: float) -> None:
         report.note(f"{points} points, rise {rise:.2f}")
@@ -141,13 +142,13 @@ def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
 
 def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
     """Report the findings of the sanity check; raise `DataError` for wrong ones unless `anyway`."""
-    report.stage("do logs and config go together?")
+    report.stage("comparing logs with config")
     found = sanity(task)
     if (bad := wrong(found)) and not anyway:
         listed = "\n".join(f"  {k}. {finding}" for k, finding in enumerate(bad, start=1))
         raise DataError(
-            f"not fitted: logs and config do not go together\n{listed}\n"
-            "expected them put right, or --anyway to fit all the same"
+            f"not fitted: logs and config contradict each other\n{listed}\n"
+            "correct the config or the logs, or use --anyway to fit all the same"
         )
     for finding in found:
         if finding.severity != "note":
@@ -158,7 +159,9 @@ def _write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds
     """Write run.json, and copies of the config and the bench file, which later commands read."""
     config = task.config
     if (bench := config.content.wheels.motor) is not None:
-        write_json(out / COPY_NAME, read_json(config.path.parent / bench, "the numbers of a motor"))
+        write_json(
+            out / COPY_NAME, read_json(config.path.parent / bench, "the parameters of a motor")
+        )
     logs = {log.name: log.sha256 for log in task.logs}
     inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}
     verdict = {"trust": trust.to_json(), "seed": task.settings.seed}
@@ -175,7 +178,7 @@ def optimised(
 
     Args:
         task: the fit task.
-        problem: the task's problem at first, `task.problem()`.
+        problem: the task's problem at the assumed lag, `task.problem()`.
         kept: checkpoint from which the fit continues, and in which every round is saved, or None.
         report: reporter of the progress.
     """
@@ -184,7 +187,7 @@ def optimised(
     lag, before = float(robot.camera.lag), problem.windows.lag
     if lag == before:
         return problem, optimum
-    report.line(f"cut anew at a lag of {lag:.2f} s; it was {before:.2f} s before")
+    report.line(f"windows cut again for a lag of {lag:.2f} s; it was {before:.2f} s before")
     again = problem.of(task.windows(robot))
     start = replace(optimum.state, round=NEAR_OPTIMUM, moved=np.inf, effect=None)
     return again, _optimised(task, again, (start, list(optimum.history)), kept, report)
@@ -237,7 +240,7 @@ def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | Non
         return None, []
     history = result.pop("history").tolist()
     start = FitState.of(result)
-    report.line(f"going on from round {start.round} of {kept.folder / CHECKPOINT}.npz")
+    report.line(f"resuming from round {start.round} of {kept.folder / CHECKPOINT}.npz")
     return start, history
 
 
@@ -259,7 +262,8 @@ def _with_mixed_runs(
 ) -> Fit:
     """Return the fit to all runs, those over several floors included.
 
-    If these contradict the fit to runs on one floor each, that fit is returned, with the reason.
+    If the runs over several floors contradict the given fit, which is of runs on one floor each,
+    the given fit is returned, with the reason.
     """
     report.stage("runs over several floors")
     mixed = multi_floor_runs(task.mixed, fit.robot)
@@ -302,8 +306,11 @@ def _mixed_sentence(about: Mapping[str, Any]) -> str:
 
     sentence = f"{about['runs']} runs over several floors: predicted within {off(about['before'])}"
     if about["after"] is None:
-        return f"{sentence} by the others; one run cannot judge what was learnt from it"
-    return f"{sentence} by the others, {off(about['after'])} after learning from the other half"
+        return (
+            f"{sentence} by the fit to the other runs; one run cannot judge what was learnt from it"
+        )
+    after = off(about["after"])
+    return f"{sentence} by the fit to the other runs, {after} after learning from the other half"
 
 
 def _with_baselines(fit: Fit, task: FitTask) -> Fit:

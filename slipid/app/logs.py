@@ -57,7 +57,7 @@ def read_dataset(
             done += 1
             report.advance(done, count)
     if short:
-        skipped.append(f"skipped: {short} runs shorter than their min_rows")
+        skipped.append(f"skipped: {short} runs with fewer rows than the min_rows of their section")
     if not logs:
         raise DataError("\n".join([*aside, *skipped]) or f"{root}: no run in any file")
     return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
@@ -78,7 +78,7 @@ def required_files(
 def files_of(
     config: Config, sections: Sequence[LogsSection], root: Path
 ) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
-    """Return the log sections that have files, each with its files, and lines about the others."""
+    """Return the log sections that have files, each with its files, and a line about each other."""
     found: list[tuple[LogsSection, list[Path]]] = []
     skipped: list[str] = []
     for section in sections:

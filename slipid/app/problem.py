@@ -2,8 +2,8 @@
 
 Priors of the load shares follow from scales under the wheels, or from masses at known places: a
 mass m at p adds weights n_i on the wheels at p_i, with sum n_i = m and sum n_i p_i = m p. For three
-wheels the solution is unique; for more, that with the least sum of squares is taken, as if all
-wheels were equally stiff.
+wheels the solution is unique; for more wheels, the minimum-norm solution is taken, as if all wheels
+were equally stiff.
 """
 
 import fnmatch
@@ -42,10 +42,11 @@ from slipid.support.progress import Reporter
 
 
 def share_priors(weights: Mapping[str, WeightsSection], shape: Geometry) -> dict[str, Choice]:
-    """Return the prior of the load shares of every load set-up whose weights are known, by name.
+    """Return the prior of the load shares for each load set-up with known weights, keyed by name.
 
     Raises:
-        ValueError: a set-up refers to an unknown one, or a wheel would have no weight on it.
+        ValueError: a set-up refers to an unknown one or to itself, or a wheel would have no weight
+            on it.
     """
     out = {}
     for name in weights:
@@ -70,10 +71,13 @@ def _wheel_weights(
     known = weights.get(name)
     if known is None or name in above:
         there = ", ".join(k for k in weights if k not in above)
-        raise ValueError(f"weights.{above[-1]}.like = {name}: expected one of {there or 'none'}")
+        raise ValueError(
+            f"weights.{above[-1]}.like = {name}: not in [weights], or it refers back to this one; "
+            f"known: {there or 'none'}"
+        )
     if known.kg is not None:
         if len(known.kg) != shape.wheels:
-            raise ValueError(f"weights.{name}.kg: {len(known.kg)}; expected {shape.wheels} numbers")
+            raise ValueError(f"weights.{name}.kg: {len(known.kg)} numbers; expected {shape.wheels}")
         return np.asarray(known.kg), known.std_kg**2
     if known.like is None or known.mass_kg is None or known.place_m is None:
         raise ValueError(f"weights.{name}: expected kg, or like, mass_kg and place_m")
@@ -89,10 +93,10 @@ def _wheel_weights(
 
 
 FREE_LENGTH = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
-"""Length that is fitted because the others are trusted, keyed by the config's `fit.lengths_from`:
-with "poses" the poses' scale is trusted, with "wheels" the wheel radius."""
+"""Length that is fitted because the other length is trusted, keyed by the config's
+`fit.lengths_from`: with "poses" the poses' scale is trusted, with "wheels" the wheel radius."""
 SIZE_STD = 0.1
-"""Std of that parameter's prior relative to its nominal value [1]: tyres deform, and cameras are
+"""Std of the fitted length's prior relative to its nominal value [1]: tyres deform, and cameras are
 set up by eye."""
 RECUT_LAG_S = 0.02
 """Difference between fitted and assumed lag above which windows are cut again [s]."""
@@ -139,9 +143,10 @@ class FitTask:
     def cutting_robot(self, near: Robot | None) -> Robot:
         """Return the robot for whose wheel radius and lag windows are cut.
 
-        It is the robot at the start of a fit. If the lag of a robot `near` an optimum differs from
-        its lag by more than `RECUT_LAG_S`, it has that other lag, because the wheel angle turned in
-        a window is linear in the lag only near the lag for which the window was cut.
+        It is the robot at the start of a fit. If a robot `near` an optimum is given and the two
+        lags differ by more than `RECUT_LAG_S`, the result has the lag of `near`, because the wheel
+        angle turned in a window is linear in the lag only near the lag for which the window was
+        cut.
         """
         robot = Space(self.robot, self.choices).template
         if near is None or abs(float(near.camera.lag - robot.camera.lag)) <= RECUT_LAG_S:
@@ -165,7 +170,8 @@ class ConfigFitTask(FitTask):
 
     Attributes:
         config: the config.
-        skipped: one line about each thing that the config names but that was not found or used.
+        skipped: one line about each log, pattern or weight in the config that was not found or not
+            used.
     """
 
     config: Config
@@ -208,7 +214,7 @@ def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
     """Return the floor map that a log section names.
 
     Raises:
-        DataError: the map cannot be read, or has a floor without runs on it alone.
+        DataError: the map cannot be read, or has a floor on which there is no single-floor run.
     """
     path = task.config.path.parent / str(section.map)
     floor = read_map(path)
@@ -216,15 +222,17 @@ def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
     for name in floor.surfaces:
         if name not in known:
             raise DataError(
-                f"{path}: surface '{name}': no run on it alone; expected some of {', '.join(known)}"
+                f"{path}: surface '{name}': no single-floor run is on it; expected one of "
+                f"{', '.join(known)}"
             )
     return floor
 
 
 def _go_together(task: ConfigFitTask, data: Runs) -> None:
-    """Raise `DataError` if runs over several floors do not fit those on one floor each.
+    """Raise `DataError` if runs that cross floors are inconsistent with the single-floor runs.
 
-    The runs must be different ones, with known load set-ups and the same number of wheels.
+    They are if a run is in both sets, has a load set-up that no single-floor run has, or has
+    another number of wheels.
     """
     names, first = {log.name for log in task.logs}, task.dataset.logs[0]
     for log in data.logs:
@@ -234,11 +242,13 @@ def _go_together(task: ConfigFitTask, data: Runs) -> None:
             )
         if log.load not in task.robot.body.loads:
             raise DataError(
-                f"{log.name}: load set-up '{log.load}': no run with it on one floor; "
+                f"{log.name}: load set-up '{log.load}': no single-floor run has it; "
                 f"expected one of {', '.join(task.robot.body.loads)}"
             )
         if log.wheels != first.wheels:
-            raise DataError(f"{log.name}: {log.wheels} wheels; expected {first.wheels}")
+            raise DataError(
+                f"{log.name}: {log.wheels} wheels; expected {first.wheels}, as in {first.name}"
+            )
 
 
 def fit_task(
@@ -271,7 +281,8 @@ def fit_task(
         freed = FREE_LENGTH["wheels" if trusted == "poses" else "poses"]
         raise DataError(
             f"{config.path}: fit.lengths_from = '{trusted}' with {freed} free in parameters; "
-            "expected one of the two: no motion tells them apart"
+            "expected only one of the two: motion determines only the ratio of wheel radius to "
+            "camera scale"
         )
     skipped = (*skipped, *left_out)
     for sentence in skipped:
@@ -365,11 +376,13 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
         if load in robot.body.loads:
             choices.append(prior)
         else:
-            skipped.append(f"skipped: weights.{load}: no run that has it")
+            skipped.append(f"skipped: weights.{load}: no run has this load set-up")
     for pattern in config.content.parameters:
         if not fnmatch.filter(paths, pattern):
             if fnmatch.filter(paths, _any_label(pattern)):
-                skipped.append(f"skipped: parameters '{pattern}': no run that has it")
+                skipped.append(
+                    f"skipped: parameters '{pattern}': no run has such a floor, load or session"
+                )
                 continue
             raise unknown_parameter(config, pattern, pattern, paths)
         choices.append(checked_choice(config, pattern, pattern, robot))
@@ -390,7 +403,7 @@ def checked_choice(config: Config, pattern: str, name: str, root: Robot | BenchR
     Args:
         config: the config.
         pattern: pattern in the config.
-        name: pattern without the label of a motor, to which the choice applies.
+        name: pattern without the label of a motor; the choice applies to the parameters that match.
         root: object with the parameters.
 
     Raises:

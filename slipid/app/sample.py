@@ -26,7 +26,7 @@ FOLDER = "sampling"
 
 
 WRITTEN = ("posterior.nc", "sample.json", "identified.json")
-"""Names of the files that are written."""
+"""Names of the files that `sample` writes."""
 
 
 def sample(
@@ -35,7 +35,7 @@ def sample(
     """Return draws of the posterior of the fit in `out`, and the content of sample.json.
 
     The draws, the content and, with new intervals, identified.json are written to `out`. An
-    interrupted chain is continued.
+    interrupted chain resumes where it stopped.
 
     Args:
         out: folder that `slipid identify` wrote.
@@ -53,8 +53,8 @@ def sample(
     _refuse_other_logs(fit, task)
     report.stage("compiling")
     fit = replace(fit, problem=task.problem(fit.robot), data=task.dataset)
-    # The key has everything that the draws depend on; the largest length of the chain is not part
-    # of it, so that a chain can be continued with a larger one.
+    # The key has everything that the draws depend on. The largest length of the chain is not part
+    # of the key, so that a finished chain can be continued with a larger limit.
     inputs = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
     kept = Checkpoint(out / FOLDER, key_of(*inputs, np.asarray(fit.z), np.asarray(fit.covariance)))
     posterior = sampled(fit, plan, draws, kept, report)
@@ -97,7 +97,7 @@ def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
 
 
 def _log_folder(out: Path, data: Path | None) -> Path:
-    """Return the given folder of the logs, else that of the fit.
+    """Return the folder of the logs: the given one, else the folder from which the fit read them.
 
     Raises:
         DataError: the folder of the fit no longer exists.

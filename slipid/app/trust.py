@@ -1,4 +1,4 @@
-"""Verdict on a fit, by comparison of its open-loop predictions with those of the encoders."""
+"""Verdict on a fit, by comparison of its open-loop predictions with encoder odometry."""
 
 import numpy as np
 

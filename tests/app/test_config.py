@@ -259,7 +259,7 @@ def test_short_runs_can_be_left_out(tmp_path):
     said = KeptMessages()
     job = job_of(tmp_path, GOOD.replace("[parameters]", "min_rows = 50\n[parameters]"), said)
     assert len(job.dataset) == 1
-    assert said.lines == ["skipped: 1 runs shorter than their min_rows"]
+    assert said.lines == ["skipped: 1 runs with fewer rows than the min_rows of their section"]
 
 
 def with_duty(folder, cells):

@@ -146,7 +146,10 @@ def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
         ({"wheel_radius_m": "0,05"}, "--wheel-radius-m '0,05': expected a number with a decimal"),
         ({"mass_kg": "0"}, "--mass-kg '0': expected a number above 0"),
         ({"mass_kg": "nan"}, "--mass-kg 'nan': expected a number above 0"),
-        ({"drive": "skid", "azimuths_deg": "1,2,3"}, "--azimuths-deg: not of drive skid"),
+        (
+            {"drive": "skid", "azimuths_deg": "1,2,3"},
+            "--azimuths-deg: not an option for drive skid",
+        ),
         ({"wheels": "4", "azimuths_deg": "1,2,3"}, "3 angles; expected 4, one per wheel"),
         ({"drive": "skid", "shared": "perhaps"}, "--shared 'perhaps': expected yes or no"),
         ({"drive": "general", "places_m": "1, 2"}, "--places-m '1, 2': expected x, y of each"),

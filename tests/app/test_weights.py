@@ -66,15 +66,15 @@ std_kg = 0.06
         ("kg = [3, 5, 4]", "weights.as_built.std_kg: missing"),
         ('kg = [3, 5, 4]\nlike = "b"\nstd_kg = 1', "expected either kg or the other three"),
         ('like = "b"\nmass_kg = 1\nstd_kg = 1', "expected kg, or like, mass_kg and place_m"),
-        ("kg = [3, 5]\nstd_kg = 0.1", "weights.as_built.kg: 2; expected 3 numbers"),
+        ("kg = [3, 5]\nstd_kg = 0.1", "weights.as_built.kg: 2 numbers; expected 3"),
         ("kg = [3, 5, -4]\nstd_kg = 0.1", "weights.as_built.kg"),
         (
             'like = "as_built"\nmass_kg = 1\nplace_m = [0, 0]\nstd_kg = 1',
-            "weights.as_built.like = as_built: expected one of none",
+            "weights.as_built.like = as_built: not in [weights], or it refers back",
         ),
         (
             'like = "b"\nmass_kg = 1\nplace_m = [0, 0]\nstd_kg = 1',
-            "weights.as_built.like = b: expected one of none",
+            "weights.as_built.like = b: not in [weights], or it refers back",
         ),
         (
             'like = "b"\nmass_kg = 20\nplace_m = [0.5, 0]\nstd_kg = 1\n'
@@ -95,7 +95,7 @@ def test_weights_are_the_prior_and_those_of_no_run_are_skipped(tmp_path):
     write_good(tmp_path)
     text = GOOD + WEIGHTS + WEIGHTS.replace("as_built", "loaded")
     job = read_fit_task(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
-    assert "skipped: weights.loaded: no run that has it" in job.skipped
+    assert "skipped: weights.loaded: no run has this load set-up" in job.skipped
     space = Space(job.robot, job.choices)
     at = space.slices["robot.load_share@as_built"]
     entry = next(e for e in space.free if e.path == "robot.load_share@as_built")

@@ -364,7 +364,7 @@ def test_a_killed_fit_goes_on_and_ends_where_it_would_have(small, tmp_path):
         invoke("identify", config, "--data", data, "--out", tmp_path / name) for name in "ab"
     )
     assert again.exit_code == whole.exit_code == 1  # the tolerance is out of reach
-    assert "going on from round" in again.stderr
+    assert "resuming from round" in again.stderr
     one, other = (json.loads((tmp_path / k / "fit.json").read_text()) for k in "ab")
     assert one["z"] == pytest.approx(other["z"], rel=1e-9, abs=1e-12)
     assert one["history"] == pytest.approx(other["history"], rel=1e-9)

@@ -268,7 +268,7 @@ def test_a_bench_that_is_none_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"b.json: No such file"):
         bench_priors(config, 16.0)
     (tmp_path / "b.json").write_text('{"schema": "slipid.identified/1", "parameters": {}}')
-    with pytest.raises(DataError, match="a robot's numbers"):
+    with pytest.raises(DataError, match="the parameters of a robot"):
         bench_priors(config, 16.0)
 
 

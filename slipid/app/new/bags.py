@@ -174,7 +174,7 @@ def _by_field_names(
 ) -> Iterator[_TopicChannel]:
     """Yield channels in messages of unknown types, recognised by the names of fields.
 
-    Such a field has a number for every wheel. `channels` were found already and are left out.
+    Such a field has a number for every wheel. Channels that are in `channels` already are omitted.
     """
     taken = {one.channel for one in channels}
     for topic in (one for one in topics if one.count and not one.serves and not one.joints):
@@ -186,7 +186,10 @@ def _by_field_names(
                 continue
             taken.add(meaning.channel)
             unit = meaning.unit or CHANNELS[meaning.channel]
-            ask = f"by the name of the field: is it that, in {unit}, in the order of the joints?"
+            ask = (
+                f"taken by the name of the field: is it the {meaning.channel} in {unit}, in the "
+                "order of the joints?"
+            )
             yield _TopicChannel(meaning.channel, topic, wheels, ask, field.path, unit)
 
 

@@ -199,7 +199,7 @@ def _picture(labels: dict[tuple[int, int], str]) -> list[str]:
 
 
 def _wheel_line(robot: Geometry, wheel: int) -> str:
-    """Return a line about a wheel: its place, drive direction and rollers."""
+    """Return a line about a wheel: its position, drive direction and rollers."""
     x, y = (float(robot.base_radius) * c for c in robot.place[wheel])
     degrees = math.degrees(robot.drive_angle[wheel]) % 360
     motion = f"drives {direction(degrees)}" + (f" ({degrees:.0f} deg)" if degrees % 90 else "")
@@ -225,7 +225,7 @@ def _tilt(drive: float, roller: float) -> str:
 
 
 def _corner(x: float, y: float) -> str:
-    """Return the corner or side of the robot, in words, at which a place x, y [m] lies."""
+    """Return the corner or side of the robot, in words, at which a point x, y [m] lies."""
     edge = 0.2 * math.hypot(x, y)
     along = "front" if x > edge else "rear" if x < -edge else ""
     return f"{along} {'left' if y > edge else 'right' if y < -edge else ''}".strip()

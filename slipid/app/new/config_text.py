@@ -10,7 +10,7 @@ from slipid.app.new.robot_questions import robot_of
 from slipid.app.reference.keys import in_short
 
 _ORDER = {
-    "omni": "each wheel drives 90 deg further than it stands",
+    "omni": "each wheel drives 90 deg counter-clockwise of its azimuth",
     "mecanum": "wheels: front left, front right, rear left, rear right",
     "skid": "wheels: front left, front right, rear left, rear right",
     "differential": "wheels: left, right",
@@ -39,8 +39,8 @@ _QUESTIONS = {
     "wheel_radius_m": _ASK_MEASURED,
 }
 _DATASHEET = (
-    "without the voltages of the motors this and the next keep their values: what are they, by the "
-    "datasheet?"
+    "no motor voltages are logged, so this parameter and the next keep these values: what are they "
+    "in the datasheet?"
 )
 FRAME = "x ahead, y left, angles counter-clockwise from ahead; wheels in the order of the columns"
 _FIT = ConfigBlock(
@@ -96,7 +96,7 @@ def _logs_block(logs: LogsDraft, first: bool) -> ConfigBlock:
     for key, value in values.items():
         comment = in_short(LogsSection, key) if first else ""
         if key == "surface" and first:
-            comment += '; "folder": the folder names it'
+            comment += '; "folder": the folder\'s name'
         question = logs.question if key == "surface" else ""
         lines.append(ConfigLine(key, toml(value), comment, question, logs.commented_out))
     if first:

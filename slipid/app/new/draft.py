@@ -32,7 +32,8 @@ class LayoutDraft:
     """Draft of the layout of one kind of file, or of bags.
 
     Attributes:
-        name: name of the layout; of a further file of a run, with `beside` and the file's name.
+        name: name of the layout; for a further file of a run, the name of the main file's layout,
+            `beside` and the file's name, joined by dots.
         settings: lines of the layout except its channels.
         channels: a line for each channel with its columns, or with its topic.
         table: key of the table of channels: columns or topics.
@@ -91,8 +92,8 @@ class ConfigDraft:
         preset_channels: channels that are logged in the format of a preset.
         above: comments at the beginning of the file.
         data: data folder, as a command line names it.
-        hints: questions by the key of `[robot]`, which replace the usual ones since they suit the
-            logs.
+        hints: questions about keys of `[robot]`, keyed by the key; they replace the general
+            questions because they suit the logs.
         sentences: lines about what was found in the logs.
     """
 

@@ -1,8 +1,8 @@
 """Recognition of the channels in a file's columns, and grouping of a folder's log files by kind.
 
 Columns are recognised by their names and numbers. Files of one kind have the same layout. For each
-kind, this module finds presets that can read it, globs that match its files, and the kinds whose
-files lie beside it.
+kind, this module finds presets that can read it, globs that match its files, and kinds with
+additional files of the same runs.
 """
 
 from collections import Counter
@@ -115,7 +115,7 @@ def rank(label: str) -> tuple[int, int, str]:
 
 
 def _resolved(found: list[FileChannel]) -> list[FileChannel]:
-    """Return the channels with ambiguous ones decided by their units and numbers.
+    """Return the channels, with ambiguous channels decided by their units and numbers.
 
     Positions are ticks or angles; "v" is a voltage or a speed.
     """
@@ -150,7 +150,10 @@ def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
 
 
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
-    """Return the channels with the same wheels as the motion, and a line about each other one."""
+    """Return the channels whose wheels match those of the motion, and a line about each other one.
+
+    The motion is the channel from which the turns of the wheels are computed.
+    """
     turns = [one for name in TURNS for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
     count = len(per_wheel[0].columns) if per_wheel else 0
@@ -163,16 +166,18 @@ def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]
             len(one.columns) != count or not _same_wheels(labels, one)
         ):
             what = f"{len(one.columns)} columns of {one.channel}"
-            dropped.append(f"{what} are left out: {count} wheels have {per_wheel[0].channel}")
+            motion = f"the {count} columns of {per_wheel[0].channel}"
+            dropped.append(f"{what} are left out: they do not match {motion}")
         else:
             kept.append(one)
     return kept, dropped
 
 
 def _same_wheels(labels: set[str], one: FileChannel) -> bool:
-    """Return whether a channel has the same labels, or labels of the other type.
+    """Return whether the labels of a channel's columns may be those of the same wheels.
 
-    The types are names of sides, such as `fl`, and numbers, which cannot be compared.
+    Labels are either names of sides, such as `fl`, or numbers. Labels of one type must be equal;
+    names and numbers cannot be compared and are accepted.
     """
     numbers = all(label.isdecimal() for label in labels)
     return set(one.labels) == labels or numbers != all(label.isdecimal() for label in one.labels)
@@ -181,7 +186,8 @@ def _same_wheels(labels: set[str], one: FileChannel) -> bool:
 def unnamed_channels(numbers: TableNumbers) -> Channels:
     """Return guessed channels of columns without names, each with a question.
 
-    Time is the first increasing column, whole numbers are ticks, and three others are the pose.
+    The first increasing column is the time, columns of large whole numbers are ticks, and the first
+    three of the other columns are x, y and heading of the pose.
     """
     values = numbers.values
     whole = [k for k in range(values.shape[1]) if _is_ticks(values[:, [k]])]
@@ -211,7 +217,7 @@ SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".parquet")
 _TELLING_COLUMNS = 8
 """Least number of named columns of a preset for which a match of all names is not by chance."""
 _FILES_TRIED = 3
-"""Largest number of files that are read to find out whether a preset fits."""
+"""Largest number of files that are read to find out whether a preset can read them."""
 
 
 def formats_below(folder: Path) -> tuple[list[TableFormat], dict[Path, str]]:
@@ -308,10 +314,10 @@ def _common_name(names: tuple[str, ...]) -> str:
 
 
 def pattern_beside(main: FileKind, other: FileKind) -> str | None:
-    """Return the name, as in `Layout.beside`, by which a file of a kind lies beside each main file.
+    """Return the name, as in `Layout.beside`, that finds a file of a kind beside each main file.
 
     The name is the same in every folder, or contains `{stem}` for the stem of the main file. The
-    result is None if there is no such name.
+    result is None if no name finds a file of the kind in the folder of every main file.
     """
     there = set(other.paths)
     first = main.paths[0]
@@ -335,10 +341,10 @@ def folder_per_run(kind: FileKind) -> bool:
 
 
 def matching_presets(kind: FileKind) -> tuple[str | None, list[str]]:
-    """Return the preset that is certainly right for a kind of files, or None, and others.
+    """Return the preset that is certainly right for a kind of files, or None, and possible presets.
 
-    Many column names of the first all match; the others can read the first files of the kind, but
-    have so few columns that this may be by chance.
+    All presets can read the first files of the kind. The certain preset has so many column names
+    that they cannot match by chance; the possible presets have fewer.
     """
     fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
     fits = [name for name in fits if _reads(kind, PRESETS[name])]

@@ -65,7 +65,7 @@ def file_draft(
     if one.unused:
         above.append(f"Not used: {', '.join(one.unused)}.")
     if not format.names_row and format.delimiter:
-        above.append("Columns without names, by their places from 0.")
+        above.append("The columns have no names; they are given by their positions from 0.")
     named = ", ".join(filter(None, format.names)) or "none have a name"
     rows = row_lines(format.delimiter, format.names_row, _units_row(one), format.first_data_row)
     return LayoutDraft(
@@ -118,7 +118,7 @@ def _layout_settings(run: RunStudy, robot: RobotAnswers) -> list[ConfigLine]:
             ask = "how many, of the motor shaft, all edges counted?" + _ticks_by_speed(run, ticks)
         lines.append(layout_line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
         step = ticks_are_increments(ticks, run)
-        ask = "do ticks add up, or does each row have those since the last?" if step is None else ""
+        ask = "are ticks a running total, or those since the previous row?" if step is None else ""
         lines.append(layout_line("ticks_are_increments", bool(step), ask))
     lines.append(layout_line("gear_ratio", robot.gear_ratio, comment="as above"))
     if run.find(*CURRENTS) is not None and not run.of_supply:
@@ -157,7 +157,7 @@ def radius_hint(run: RunStudy, robot: RobotAnswers) -> dict[str, str]:
     radius = ratio / factor(unit, "rad/s")
     if not RADII[0] <= radius <= RADII[1]:
         return {}
-    ask = f"taken by default: measure it; the poses say about {radius:.2g}"
+    ask = f"taken by default: measure it; by the poses it is about {radius:.2g}"
     return {"wheel_radius_m": ask}
 
 
@@ -187,9 +187,9 @@ def _unusable(found: FileChannel, run: RunStudy) -> dict[str, str] | None:
     if channel == "voltage" and is_battery_voltage([one for one in runs if one], run.find(*SPEEDS)):
         return {"comment": _BATTERY_VOLTAGE}
     if channel == "bus_voltage" and run.find("duty") is None:
-        return {"comment": "of use beside a duty cycle alone"}
+        return {"comment": "used only together with a duty cycle"}
     if channel.startswith("pose_") and not run.has_pose:
-        return {"comment": "a pose in parts is none: x, y and a heading"}
+        return {"comment": "not used: a pose needs x, y and a heading"}
     if channel.startswith("pose_") and run.place_unit.unit in PIXELS:
         return {"question": "give metres_per_pixel in the layout" if channel == "pose_x" else ""}
     return None

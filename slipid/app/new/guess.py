@@ -127,7 +127,7 @@ class SortedFiles:
         groups: runs made of the other kinds.
         hints: comments about published formats that may fit.
         sentences: lines about files that were found or left out.
-        paths: every file, those included that are left out or not logs.
+        paths: every file, including files that are left out or are not logs.
     """
 
     root: Path
@@ -187,7 +187,10 @@ def _siblings(path: Path, kind: FileKind) -> list[RunStudy]:
 
 
 def _run_files(kinds: list[RunStudy]) -> tuple[list[RunStudy], list[str]]:
-    """Return runs of each kind with wheels and the kinds beside it, and lines about the rest."""
+    """Return the runs of each kind of files with wheels, and lines about files of no run.
+
+    Files of other kinds beside the file with the wheels are added to the run.
+    """
     mains = [run for run in kinds if run.main.wheels] or kinds[:1]
     rest = [run for run in kinds if run not in mains]
     if len(mains) > 1 and not any(run.complete for run in mains):
@@ -211,7 +214,7 @@ def _run_files(kinds: list[RunStudy]) -> tuple[list[RunStudy], list[str]]:
         group = replace(run, beside=tuple(beside))
         groups.append(replace(group, others=_more_runs(group)))
     lost = [run.kind.paths[0] for run in rest if run not in used]
-    lines = [f"{path}: no wheels in it, and no channels for a run beside it" for path in lost]
+    lines = [f"{path}: it has no wheels, and adds no channel to another file" for path in lost]
     return groups, lines
 
 

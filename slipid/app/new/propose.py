@@ -26,7 +26,7 @@ from slipid.support.errors import DataError
 
 FLOOR = "floor"
 _NOT_WHOLE = "Without wheels or without a pose, so nothing to fit:"
-_FLOOR = "on which floor was {} driven? Its name, or folder where folders are called after floors"
+_FLOOR = 'on which floor was {} driven? Its name, or "folder" if folders are named after floors'
 
 
 def propose(path: Path, options: RobotOptions) -> ConfigDraft:
@@ -78,10 +78,10 @@ def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[F
     except DataError:
         return
     channels = ", ".join(channel.removeprefix("motor_") for channel in guessed.channels)
-    also = 'several logs of it: drive = "motor" in [robot] of a config, see slipid reference'
+    also = 'for several logs of a motor: drive = "motor" in [robot] of a config (slipid reference)'
     raise DataError(
         f"{path}: no wheels and no pose; "
-        f"{first.name} is like that of a motor on a bench ({channels})\n"
+        f"{first.name} looks like the log of a motor on a bench ({channels})\n"
         f"run: slipid motor {first} --out DIR\n{also}"
     )
 
@@ -151,7 +151,9 @@ def _checked_by_reader(draft: ConfigDraft, runs: Sequence[RunStudy], wheels: int
     for layout in draft.layouts:
         questions = list(layout.questions)
         if layout.name in first and wheels and drives != wheels:
-            questions.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
+            questions.append(
+                f"[robot] has {drives} drives, but {wheels} have columns: which is right?"
+            )
         try:
             if layout.name in first:
                 _read(draft, layout.name, first[layout.name])
@@ -185,12 +187,12 @@ def _problem(error: DataError) -> str:
 
 
 def _read(draft: ConfigDraft, name: str, path: Path) -> Sequence[Log]:
-    """Return the runs in a file, which is read with the draft's layout of this name.
+    """Return the runs in a file, which is read with the draft's layout of the given name.
 
-    There are none if no section of the draft uses the layout.
+    There are no runs if no section of the draft uses the layout.
 
     Raises:
-        DataError: the file cannot be read so.
+        DataError: the file cannot be read with this layout.
     """
     config = parsed(Path("robot.toml"), new_config(draft, "robot.toml").text)
     for section in config.content.logs:

@@ -90,7 +90,10 @@ def _parts(text: str) -> list[str]:
 
 
 def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
-    """Return an angle for every wheel [deg] from a text with numbers separated by commas."""
+    """Return an angle for every wheel [deg] from a text with numbers separated by commas.
+
+    Semicolons are accepted as well.
+    """
     found = tuple(number(part) for part in _parts(text))
     if len(found) != answers.wheels:
         raise ValueError(f"{len(found)} angles; expected {answers.wheels}, one per wheel")
@@ -98,7 +101,7 @@ def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
 
 
 def places(text: str, _: RobotAnswers) -> tuple[tuple[float, ...], ...]:
-    """Return the places x, y of at least two wheels [m] from a text such as `0.2,0.1; 0.2,-0.1`."""
+    """Return the centres x, y of two or more wheels [m] from a text such as `0.2,0.1; 0.2,-0.1`."""
     found = tuple(tuple(number(c) for c in part.split(",")) for part in text.split(";"))
     if len(found) < 2 or any(len(place) != 2 for place in found):
         raise ValueError("expected x, y of each wheel, as in: 0.2, 0.1; 0.2, -0.1; -0.2, 0")
@@ -194,7 +197,7 @@ _DIRECTIONS = RobotQuestion(
 )
 _ROLLERS = RobotQuestion(
     "rollers_deg",
-    "angles of the rollers to them [deg], none without rollers",
+    "angles from the free-rolling direction of the rollers to these directions [deg], or none",
     _per_wheel("none"),
     rollers,
 )
@@ -257,14 +260,17 @@ def _refuse_other_drives(
     for name in options.keys() - {"drive", *(question.name for question in questions)}:
         expected = ", ".join(question.option for question in questions)
         raise DataError(
-            f"--{name.replace('_', '-')}: not of drive {drive}; expected some of {expected}"
+            f"--{name.replace('_', '-')}: not an option for drive {drive}; known: {expected}"
         )
 
 
 def _with_question(
     answers: RobotAnswers, question: RobotQuestion, options: RobotOptions, asker: Asker | None
 ) -> RobotAnswers:
-    """Return the answers, with the answer to one more question added."""
+    """Return the answers, with the answer to one more question added.
+
+    It comes from the options, else from the user (asked until it is valid), else from the default.
+    """
 
     def read(text: str) -> RobotAnswers:
         more: dict[str, Any] = {question.name: question.read(text, answers)}

@@ -19,7 +19,7 @@ RADII = (0.012, 0.6)
 """Plausible range of wheel radii [m]."""
 _TURNED, _NEAR_TURN = 0.5, 5.0
 """Range of the integrated turn rate above which it decides the unit of a heading [rad], and factor
-by which the two ranges may then differ [1]."""
+by which the range of the heading may then differ from it [1]."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class UnitGuess:
 
     Attributes:
         unit: the unit.
-        reason: reason for it, a comment in the config; empty if there is none.
-        doubt: question to the user about it; empty if there is none.
+        reason: reason for the unit, which becomes a comment in the config; empty if there is none.
+        doubt: question to the user about the unit; empty if there is none.
     """
 
     unit: str
@@ -116,7 +116,7 @@ def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> Unit
         times = float(np.ptp(known)) / turned
         for unit, expected in (("rad", 1.0), ("deg", 180.0 / np.pi)):
             if expected / _NEAR_TURN < times < expected * _NEAR_TURN:
-                return UnitGuess(unit, f"turns {times:.2g} times as far as the turn rate says")
+                return UnitGuess(unit, f"range is {times:.2g} times that by the turn rate")
     if most <= 6.2832 + 1e-3:
         doubt = "radians or degrees? It never turns far" if most < 0.5 else ""
         return UnitGuess("rad", f"up to {most:.3g}", doubt)
@@ -162,7 +162,7 @@ def angle_unit(ratio: float | None, radius: float | None) -> UnitGuess:
     for unit in ("rad", "deg", "rev"):
         if low <= ratio / factor(unit, "rad") <= high:
             return UnitGuess(unit, "turns as far as the pose goes")
-    return UnitGuess("rad", doubt="radians, degrees, turns or ticks? The pose goes another way")
+    return UnitGuess("rad", doubt="radians, degrees, turns or ticks? None agrees with the pose")
 
 
 def usual_unit(channel: str) -> UnitGuess:
@@ -183,4 +183,4 @@ def duty_unit(most: float) -> UnitGuess:
         return UnitGuess("1", f"up to {most:.3g}")
     if most <= 105:
         return UnitGuess("percent", f"up to {most:.3g}")
-    return UnitGuess("1", doubt=f"it reaches {most:.4g}: give scale, 1 over what stands for full")
+    return UnitGuess("1", doubt=f"it reaches {most:.4g}: give scale = 1 / value at full duty")

@@ -61,7 +61,7 @@ def purpose(kind: type) -> str:
 
 
 def keys(kind: type) -> dict[str, str]:
-    """Return the key, as a config spells it, by attribute of a model or a dataclass.
+    """Return the key, as a config spells it, of each attribute of a model or a dataclass.
 
     Attributes are in the order of declaration.
     """

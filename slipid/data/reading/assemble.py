@@ -91,7 +91,7 @@ def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
 
 
 def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time column"]:
-    """Return the latest reading at every time of the clock; before the first reading, the first."""
+    """Return the latest reading at each time of the clock; the first one before any reading."""
     if signal.time is clock and not np.isnan(signal.values).any():
         return signal.values.copy()
     out = np.empty((len(clock), signal.values.shape[1]))
@@ -107,7 +107,7 @@ def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray
 def _fresh(
     signal: Signal | None, clock: Float[np.ndarray, " time"]
 ) -> Bool[np.ndarray, "time column"] | None:
-    """Return whether a channel was measured at each time; None if it was at all times, or never."""
+    """Return whether a channel was measured at each time; None if always, or if not logged."""
     if signal is None or (signal.time is clock and not np.isnan(signal.values).any()):
         return None
     out = np.zeros((len(clock), signal.values.shape[1]), dtype=bool)
@@ -182,8 +182,9 @@ def _ticks(
 def _of_wheels(signals: Mapping[str, Signal], layout: SensorLayout) -> dict[str, Signal]:
     """Return the signals, with wheel speeds and currents computed if they were not logged.
 
-    These speeds are the motor speeds divided by the gear ratio; these currents are the logged
-    torques divided by the torque constant.
+    The computed speeds are the motor speeds divided by the gear ratio. The computed currents are
+    the motor torques divided by the torque constant; wheel torques are divided by the gear ratio as
+    well.
     """
     gear, constant = layout.gear_ratio, float(layout.torque_constant or 1.0)
     out = dict(signals)
@@ -257,7 +258,8 @@ def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]
             f"that of {log.name}; expected poses of the same run, with starts, stops and turns in "
             "both, and the correct frame rate of the video"
         )
-    # The times of the log start at zero if the robot's clock counts from 1970.
+    # The offset refers to the times of the log, which start at 0 if the robot's clock counts from
+    # 1970, so the start that was subtracted is added again.
     turns = next(name for name in TURNS if name in run.signals)
     start = float(run.signals[turns].time[0] - log.time[0])
     return replace(clock, offset=clock.offset + start)

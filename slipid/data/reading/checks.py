@@ -22,10 +22,9 @@ _LIMITS = {
     "current": (1000.0, "A"),
     "bus_voltage": (1000.0, "V"),
     "duty": (1.5, "(a share of 1)"),
-    "voltage": (
-        1000.0,
-        "V",
-    ),  # Checked last, since it may be the product of the two channels above.
+    # The voltage comes after bus voltage and duty, since it may be their product: then the error is
+    # about the wrong one of these two.
+    "voltage": (1000.0, "V"),
     "gyro": (100.0, "rad/s"),
 }
 
@@ -114,7 +113,7 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout)
     commanded = np.abs(integral(log.time, command)[-1])
     still = np.ptp(log.wheel_angle, axis=0) == 0
     if (dead := first_true(still & (commanded > 1.0))) is not None:
-        found = f"constant, though the wheel was commanded {commanded[dead]:.3g} rad"
+        found = f"constant, though the wheel was commanded to turn {commanded[dead]:.3g} rad"
         raise _at(log, signals, "wheel", None, dead, found, "a wheel that turns when commanded")
 
 
@@ -133,7 +132,7 @@ def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -
         if jumps.max(initial=0.0) > limit:
             i = int(np.argmax(jumps > limit))
             found = f"the {what} jumps by {jumps[i]:.3g} {unit}"
-            expected = f"at most {limit:.3g} {unit} between poses; another marker, or a wrong unit?"
+            expected = f"at most {limit:.3g} {unit} between poses; another marker, or wrong unit?"
             raise UnusablePose(str(_at(log, signals, column, int(rows[i + 1]), 0, found, expected)))
     turned = np.ptp(log.wheel_angle, axis=0).max(initial=0.0)
     if turned > 2.0 and np.ptp(pose, axis=0).max() == 0:
@@ -155,7 +154,7 @@ _NAMES = {
     "current": ("current", "motor_torque", "wheel_torque"),
     "voltage": ("voltage", "duty"),
 }
-"""Channels of a file from which a channel of the log may be computed, by the name of the latter."""
+"""Channels of a file from which a channel of the log may be computed, keyed by the latter."""
 
 
 def _at(
@@ -167,7 +166,7 @@ def _at(
     found: str,
     expected: str,
 ) -> DataError:
-    """Return the error about a value of the log, with the place in the file from which it was read.
+    """Return the error about a value of the log, with the row and column of the file it came from.
 
     Args:
         log: the log.

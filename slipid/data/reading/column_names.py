@@ -83,7 +83,8 @@ _SUFFIXES = {
 """Units by the endings of column names that denote them."""
 _BY_UNIT = {"tick": "ticks", "A": "current", "V": "voltage", "N*m": "torque", "rad/s": "speed"}
 _SHORT = ("v", "a", "s", "m")
-"""Endings that are taken as units only if the name is not understood with them as words."""
+"""Endings that may be words as well: they are taken as units only if the whole name, with the
+ending as a word, has no meaning."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ class ColumnMeaning:
             only the numbers can decide between two channels; or `odometry`; empty if the name has
             no known meaning.
         label: name of the wheel, such as `fl` or `2`, or component of a quaternion; else empty.
-        unit: unit in the name or in the row of units; empty if there is none that fits.
+        unit: unit in the name or in the row of units; empty if there is none that suits the
+            channel.
         doubt: text about an assumption that was made, for the user to confirm; else empty.
     """
 
@@ -117,9 +119,8 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
     bare, suffix = without_unit(name)
     unit = unit_in(unit) or unit or suffix
     texts = [bare] if "[" in name or "(" in name or "," in name else [bare, name]
-    if (
-        name[len(bare) :].lower()[1:] in _SHORT
-    ):  # v may mean a speed; a and s have other meanings, too
+    # An ending such as v may be a word (speed) instead of a unit: the whole name is tried first.
+    if name[len(bare) :].lower()[1:] in _SHORT:
         texts.reverse()
     tried = [(name_parts(text), strict) for strict in (True, False) for text in texts]
     for parts, strict in tried:
@@ -229,7 +230,8 @@ def name_parts(name: str) -> NameParts:
 def _split(name: str) -> list[str]:
     """Return the words and numbers of a name, in lower case.
 
-    A name is split at capitals, digits, and characters that are neither; `1st` becomes 1.
+    A name is split at capitals, at digits, and at characters that are neither letters nor digits;
+    `1st` becomes 1.
     """
     name = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Za-z])(?=\d)", "_", name)
     name = re.sub(r"(\d)(?:st|nd|rd|th)\b", r"\1", name.lower())
@@ -240,7 +242,7 @@ def _split(name: str) -> list[str]:
 def _apart(word: str) -> list[str]:
     """Return the shortest list of known words that form a compound such as `setvel` or `wl`.
 
-    If there are none, the result is the word itself.
+    If there is no such list, the result is the word itself.
     """
     best: list[list[str] | None] = [[]] + [None] * len(word)
     for end in range(1, len(word) + 1):
@@ -316,7 +318,8 @@ def _label(parts: NameParts) -> str:
 def _measured(parts: NameParts, unit: str) -> str | None:
     """Return the measured quantity of a wheel or motor, or None.
 
-    It is the channel's name after `wheel_` or `motor_`; `position` and `v` may mean two channels.
+    The quantity is the channel's name after `wheel_` or `motor_`; `position` may mean ticks or an
+    angle, and `v` a voltage or a speed.
     """
     if parts.has("what", "command"):
         return "speed_command" if not parts.has("what", "current", "torque", "voltage") else None
@@ -325,9 +328,8 @@ def _measured(parts: NameParts, unit: str) -> str | None:
     for what in ("ticks", "current", "torque", "voltage", "duty", "speed"):
         if parts.has("what", what):
             return what
-    if parts.has(
-        "what", "position", "angle", "yaw"
-    ):  # w is checked later, since it may mean a wheel
+    # The word w is tried after these words, since it may mean a wheel instead of a speed.
+    if parts.has("what", "position", "angle", "yaw"):
         return "position"
     if parts.has("what", "angular", "w"):
         return "speed"
@@ -338,9 +340,10 @@ def _measured(parts: NameParts, unit: str) -> str | None:
 
 
 def _single(parts: NameParts) -> tuple[str, str] | None:
-    """Return the channel, if it is one of the whole robot, and the component of a quaternion.
+    """Return the channel of the whole robot that a name denotes, and the quaternion's component.
 
-    The component is empty for other channels; the result is None for channels of wheels.
+    The component is empty for channels other than a quaternion. The result is None if the name
+    denotes no channel of the whole robot, but, for example, one of the wheels.
     """
     what = set(parts.of("what"))
     axis = parts.words("axis")

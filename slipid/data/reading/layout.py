@@ -52,7 +52,7 @@ GROUPS = {
     "pose": ("pose_x", "pose_y", "pose_heading"),
     "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
 }
-"""Groups of channels that one message contains, by the name of the group in the layout of a bag."""
+"""Groups of channels that one message contains, keyed by the group's name in a bag layout."""
 TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
 """Channels from which the turns of the wheels can be computed; the first available one is used."""
 
@@ -127,7 +127,7 @@ class SensorLayout:
     max_heading_jump: Positive = 1.6
 
     def lacks(self, channels: Collection[str]) -> str | None:
-        """Return a text about a channel or setting that channels need and that is absent, or None.
+        """Return a text about a missing channel or setting that some channels need, or None.
 
         `channels` are all channels of a run.
         """

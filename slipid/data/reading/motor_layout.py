@@ -44,7 +44,7 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
 
     Args:
         format: format of the file, with the positions of names and numbers.
-        given: columns named by the user, by channel.
+        given: columns named by the user, keyed by channel.
         signed: True if currents have a sign.
 
     Raises:
@@ -90,8 +90,8 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
 def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, ...]:
     """Return the columns whose names denote a channel; a single one for time and bus voltage.
 
-    Names that need an assumption, and names without the number of a motor, are used only if there
-    are no others.
+    Names that need an assumption, and names without the number of a motor, are used only if no
+    other names denote the channel.
     """
     found = {name: one for name, one in meanings.items() if one.channel == channel}
     names = [name for name, one in found.items() if not one.doubt] or list(found)
@@ -104,8 +104,8 @@ def _channel(
 ) -> Channel:
     """Return a channel from its columns.
 
-    The unit is the given one, else that in the column's name or in the row of units, else the
-    channel's SI unit.
+    The unit is the argument `unit` if it is given, else the unit in the column's name or in the row
+    of units, else the channel's SI unit.
     """
     usual, name = CHANNELS[channel], columns[0]
     row = format.units[format.names.index(name)]
@@ -119,7 +119,7 @@ def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) 
 
     `names` are the columns of the file, for the message.
     """
-    have = f"it has {', '.join(names)}"
+    have = f"the file has {', '.join(names)}"
     for wanted, option in (
         (("time",), "--time"),
         (("current",), "--current"),
@@ -132,6 +132,6 @@ def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) 
     if len({*count.values()}) > 1:
         listed = ", ".join(f"{k} {', '.join(map(str, channels[k].columns))}" for k in count)
         raise DataError(
-            f"{path}: columns for different numbers of motors ({listed}); name the columns by "
-            "options"
+            f"{path}: columns for different numbers of motors ({listed}); expected as many for "
+            "every channel: name the columns of each channel by options"
         )

@@ -87,8 +87,8 @@ PRESETS = {
     "robotino2022_motor": replace(_ROBOTINO_2022, channels=_MOTORS_2022),
     # Each row is a mean of 13 samples; a file has 204 runs, at whose start the encoders restart
     # from 0. There is no time column: ticks over reported speed (which is 1.3 % too high) give 0.45
-    # s between rows. Headings near 0 and 360 deg are wrong, since they are means of both; so jumps
-    # of the heading are not treated as errors.
+    # s between rows. Headings near the wrap-around are wrong, since they are means of values near 0
+    # and values near 360 deg; so the largest allowed jump of the heading is more than half a turn.
     "robotino2021": replace(
         _ROBOTINO,
         new_run="ticks_restart",
@@ -152,7 +152,7 @@ PRESETS = {
         },
     ),
 }
-"""Layouts of published log formats, by the name of the preset."""
+"""Layouts of published log formats, keyed by the name of the preset."""
 POSES = ("pose_x", "pose_y", "pose_heading", "pose_quaternion")
 """Channels of the pose, which may have been logged with another clock than the wheels."""
 _SETTINGS = [f.name for f in fields(Layout) if f.name not in ("channels", "beside")]
@@ -185,7 +185,7 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
     others = given.pop("beside", {})
     if not isinstance(others, dict) or not all(isinstance(v, dict) for v in others.values()):
         raise DataError(
-            f"{where} beside: {others!r}; expected a table of layouts, by the names of files"
+            f"{where} beside: {others!r}; expected a table of layouts, keyed by file names"
         )
     layout = _declared_file(given, where)
     beside = dict(layout.beside)
@@ -208,7 +208,7 @@ def _declared_file(table: Mapping[str, object], where: str) -> Layout:
             known = ["format", "columns", "beside", *_SETTINGS]
             raise DataError(f"{where}: {unknown('key', key, known)}")
     if not isinstance(columns, dict):
-        raise DataError(f"{where} columns: {columns!r}; expected a table")
+        raise DataError(f"{where} columns: {columns!r}; expected a table of channels")
     base = Layout({}) if name is None else PRESETS[str(name)]
     channels = dict(base.channels)
     for channel, spec in columns.items():

@@ -41,8 +41,8 @@ def read_runs(
 ) -> Runs:
     """Return every run of the files that match a glob.
 
-    Runs with another load set-up are read by another call and added to these, as in `as_built +
-    moved`.
+    Runs with another load set-up are read by a separate call, and the two sets are added, as in
+    `as_built + moved`.
 
     Args:
         folder: data folder, to which the names of the runs are relative.
@@ -176,7 +176,7 @@ def _beside(path: Path, pattern: str, layout: Layout) -> Table:
         there = sorted(p.name for p in path.parent.iterdir() if p.is_file() and p != path)
         raise DataError(
             f"{other}: missing; expected in the folder of {path.name}, as declared in the layout "
-            f"(which has {first_names(there, 'nothing else')})"
+            f"(the folder has {first_names(there, 'nothing else')})"
         )
     return read_table(other, layout)
 
@@ -207,8 +207,8 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
 def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
     """Return the main files of runs, without their additional files.
 
-    A glob such as `*.csv` finds both kinds; if the layout has no additional files, all are
-    returned.
+    A glob such as `*.csv` finds both kinds of files; if the layout has no additional files, all
+    files are returned.
     """
     if isinstance(layout, BagLayout):
         return list(paths)

@@ -30,13 +30,13 @@ class SignalSource:
     def error(
         self, found: str, expected: str, sample: int | None = None, column: int | None = None
     ) -> DataError:
-        """Return the error about a sample, counted from 0, or, if it is None, about all samples.
+        """Return the error about one sample, or about all samples if `sample` is None.
 
         Args:
             found: what is wrong.
             expected: what was expected instead.
-            sample: index of the sample, or None.
-            column: index of the column, or None.
+            sample: index of the sample from 0, or None.
+            column: index of the column from 0, or None for an error about all columns.
         """
         row = None if sample is None else int(self.lines[sample])
         name = None if column is None or not self.columns else self.columns[column]
@@ -113,7 +113,11 @@ def first_true(mask: Bool[np.ndarray, " _"]) -> int | None:
 
 
 def heading(turned: Signal) -> Signal:
-    """Return the yaw angle [rad] of quaternions x, y, z, w; their length must be 1."""
+    """Return the yaw angle [rad] of quaternions x, y, z, w.
+
+    Raises:
+        DataError: the length of a quaternion is not close to 1.
+    """
     x, y, z, w = turned.values.T
     size = np.sqrt(x**2 + y**2 + z**2 + w**2)
     if (bad := first_true(np.abs(size - 1.0) > 0.05)) is not None:

@@ -107,7 +107,8 @@ def bytes_of(path: Path, limit: int = -1) -> bytes:
         with path.open("rb") as file:
             raw = file.read(limit)
     except OSError as error:
-        raise bad_data(path, f"cannot be read ({error.strerror})", "a readable file") from error
+        expected = "a CSV or Parquet file that can be opened; check its permissions"
+        raise bad_data(path, f"cannot be read ({error.strerror})", expected) from error
     if not raw.strip():
         raise bad_data(path, "the file is empty", "a header and rows of numbers")
     return raw
@@ -128,7 +129,7 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
     try:
         table = parquet.read_table(pyarrow.BufferReader(raw))
     except pyarrow.ArrowException as error:
-        raise bad_data(path, f"no Parquet ({error})", "a whole Parquet file") from error
+        raise bad_data(path, f"not Parquet ({error})", "a complete Parquet file") from error
     if not table.num_rows:
         raise bad_data(path, "no rows", "rows of numbers")
     return table
@@ -137,9 +138,9 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
 def parquet_numbers(
     path: Path, raw: bytes
 ) -> tuple[list[str], Float[np.ndarray, "row column"], frozenset[int]]:
-    """Return names and numbers of the columns in a Parquet file, and the positions of the others.
+    """Return the names and numbers of a Parquet file, and the positions of columns with texts.
 
-    The numbers are NaN in columns that have none.
+    The numbers of a column with texts are NaN.
     """
     import pyarrow
 
@@ -194,7 +195,8 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
     """Return the name of every column, empty if it has none; without names, the positions as texts.
 
     Raises:
-        DataError: the file ends before, another delimiter is used, or the names are numbers.
+        DataError: the file ends before the row of names, another delimiter is used, or the names
+            are numbers.
     """
     row = layout.names_row or layout.first_data_row
     if len(lines) < row:
@@ -227,7 +229,7 @@ def wanted_names(
     for name in used:
         if name not in header:
             near = get_close_matches(name, [other for other in header if other not in used], n=2)
-            hint = f"did you mean {' or '.join(near)}? It has" if near else "it has"
+            hint = f"did you mean {' or '.join(near)}? The file has" if near else "the file has"
             expected = f"it among the column names; {hint} {', '.join(filter(None, header))}"
             raise bad_data(path, "no such column", expected, row=row, column=name)
     names = tuple(filter(None, header)) if all_columns else used
@@ -253,9 +255,9 @@ def check_fields(path: Path, body: list[str], header: list[str], layout: Layout)
         expected = usual
     bad = int(np.flatnonzero(counts != expected)[0])
     row, line = layout.first_data_row + bad, body[bad]
-    wanted = f"{expected} as in the {'names' if layout.names_row else 'other rows'}"
+    wanted = f"{expected} cells, as in {'the row of names' if layout.names_row else 'other rows'}"
     if not line.strip():
-        raise bad_data(path, "an empty line", wanted + " cells", row=row)
+        raise bad_data(path, "an empty line", wanted, row=row)
     found = f"{counts[bad]} cells"
     if bad == len(body) - 1 and counts[bad] < expected:
         found += " in the last line, as if the log was cut off while it was written"

@@ -58,7 +58,7 @@ class TableFormat:
 
     @property
     def signature(self) -> "TableFormat":
-        """Return the format without its path, which is equal for all files of one type."""
+        """Return the format without its path; it is equal for all files of one type."""
         return replace(self, path=Path())
 
     def column(self, at: int) -> str | int:
@@ -104,11 +104,12 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
     names_row, units_row = _header_rows(rows[:first], len(rows[first]))
     top = rows[names_row - 1] if names_row else []
     if not top and any(number_in(c) is None and c.lower() not in MISSING for c in rows[first]):
-        raise bad_data(path, "texts among the numbers, and no names", "a log", row=first + 1)
+        expected = "a log: a row of column names, or numbers alone"
+        raise bad_data(path, "texts among the numbers, and no names", expected, row=first + 1)
     width = len(top) or len(rows[first])
     names = [*top, *[""] * width][:width]
     if names_row and width > 1 and not names[-1]:
-        width -= 1  # every line ends with a delimiter
+        width -= 1  # no last column: every line ends with a delimiter
     units = rows[units_row - 1] if units_row else []
     units = [*units, *[""] * width][:width]
     where = (names_row, units_row, first + 1)

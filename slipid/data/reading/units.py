@@ -46,8 +46,8 @@ KNOWN = (
 
 @lru_cache(maxsize=1)
 def _registry() -> "pint.UnitRegistry[Any]":
-    # Pint is imported here because its import is slow and most commands read no log.
     """Return pint's registry with the units above."""
+    # Pint is imported here because its import is slow and most commands read no log.
     import pint
 
     registry: pint.UnitRegistry[Any] = pint.UnitRegistry(None)

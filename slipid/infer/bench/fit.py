@@ -4,10 +4,10 @@ With the moments g of both equations, their scatter S and Gaussian priors in the
 
     -2 log pi(z) = g(z)^T S^-1 g(z) + |(z - mean) / std|^2 + const
 
-(Chernozhukov and Hong 2003: it may replace a likelihood if only the mean of g is known). Weights, S
-and z are updated in turn. With J the derivative of the residuals in that sum, the inverse of J^T J
-equals the sandwich covariance of robust statistics: intervals are valid although the noise is
-neither white nor Gaussian nor known.
+(Chernozhukov and Hong 2003: such a quasi-posterior may replace a posterior if only the mean of g is
+known). Weights, S and z are updated in turn. With J the derivative of S^-1/2 g and of the prior's
+residuals with respect to z, the inverse of J^T J equals the sandwich covariance of robust
+statistics: intervals are valid although the noise is neither white nor Gaussian nor known.
 
 Least squares and Kalman smoothers are unsuitable because the current is a noisy input: least
 squares underestimates R by the fraction of noise in the current's variance, and a smoother needs
@@ -49,16 +49,16 @@ from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.search_space import Choice, Space
 
 MOST_ROUNDS = 30
-"""Largest number of updates of weights, scatter and numbers."""
+"""Largest number of updates of weights, scatter and parameters."""
 SETTLED_STDS = 0.02
-"""Largest change of a number in the last round of a converged fit [std]."""
+"""Largest change of a parameter in the last round of a converged fit [std]."""
 TIME_CONSTANT_STD_S = 2e-3
 """Prior std of the electrical time constant L_a / R [s]."""
 MOMENTS = (len(VOLTS) - 1, len(AMPS))
 """Number of moments of the electrical and of the mechanical equation.
 
-The last signal, the sign given to unsigned currents, is an instrument in the mechanical one
-only."""
+The last signal of both, the sign given to unsigned currents, is an instrument in the mechanical
+equation only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +68,14 @@ class MotorFit:
     Attributes:
         label: label of the motor, "" for a single one.
         records: runs of the motor.
-        space: free and fixed numbers with their priors.
+        space: free and fixed parameters with their priors.
         choices: user's choices.
         z: search vector at the optimum.
         covariance: covariance of the search vector.
         equations: the electrical equation, absent without voltage, and the mechanical one.
         correlation_time: time over which residuals are correlated [s].
-        independent_times: length of the records over the correlation time.
-        converged: True if the numbers converged.
+        independent_times: length of the records divided by twice the correlation time.
+        converged: True if the parameters converged.
         reason: sentence on how the fit ended.
         rounds: number of rounds.
     """
@@ -95,13 +95,13 @@ class MotorFit:
 
     @property
     def motor(self) -> BenchMotor:
-        """Motor with the fitted numbers."""
+        """Motor with the fitted parameters."""
         found: BenchMotor = self.space.tree(jnp.asarray(self.z)).motor
         return found
 
     @property
     def noise(self) -> dict[str, float | None]:
-        """Std of the white noise of each sensor by channel, None for a channel without a sensor."""
+        """Std of the white noise of each channel, None for a channel that was not logged."""
         volts = [r.voltage for r in self.records if r.voltage is not None]
         return {
             "voltage": noise(volts) if volts else None,
@@ -123,7 +123,7 @@ class _Objective(eqx.Module):
     """Arguments of the search for the optimum.
 
     Attributes:
-        space: free numbers with their priors.
+        space: free parameters with their priors.
         root: S^-1/2, which whitens the moments.
         constant: h of each equation, the mechanical one last.
         slope: G of each equation.
@@ -144,7 +144,7 @@ def fit_motor(
     scaled = [*_scaled(records, float(first.resistance)), *choices]
     space = Space(BenchRoot(BenchMotor()), scaled)
     z = space.vector(BenchRoot(first))
-    # If the user has given a start value for a number, it is used.
+    # Start values from the user replace those estimated from the equations.
     started = [c.pattern for c in choices if c.start is not None]
     chosen = space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in started))
     z = np.where(chosen, space.start, z)
@@ -162,7 +162,7 @@ def fit_motor(
         moved = float(np.max(np.abs(new - z) / np.sqrt(np.diag(covariance)), initial=0.0))
         z, rounds = new, rounds + 1
     settled = moved < SETTLED_STDS and bool(np.isfinite(z).all())
-    reason = f"no number changed by {100 * SETTLED_STDS:g} % of its std in round {rounds}"
+    reason = f"no parameter changed by {100 * SETTLED_STDS:g} % of its std in round {rounds}"
     return MotorFit(
         label=label,
         records=tuple(records),
@@ -180,21 +180,21 @@ def fit_motor(
 
 
 def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> BenchMotor:
-    """Return start values from each equation alone; negative ones are replaced by defaults."""
+    """Estimate start values from each equation separately; defaults replace negative estimates."""
     usual = BenchMotor()
     r, c, drop, slow, one = float(usual.resistance), float(usual.back_emf), 0.0, 0.0, 0.0
     if volts is not None:
         found = start(volts, MOMENTS[0])
         r, c = (float(x) if x > 0 else y for x, y in zip(found, (r, c), strict=False))
         drop, slow, one = map(float, found[2:5])
-    # With unsigned currents, the zero of the ammeter and friction have the same signal, so the zero
-    # is left out.
+    # With unsigned currents, the zero of the ammeter and friction have the same signal: the zero is
+    # not estimated then.
     k = start(amps, MOMENTS[1] if signed else MOMENTS[1] - 1)
     torque = (usual.rotor_inertia, usual.coulomb_friction, usual.viscous_friction)
     j, tau, b = (float(x) * c if x > 0 else float(y) for x, y in zip(k, torque, strict=False))
     zero = float(k[3])
     return BenchMotor(
-        # in the order of their declaration
+        # The order is that in which `BenchMotor` declares its parameters.
         *map(jnp.asarray, (r, c, slow, drop, tau, b, j, zero, one + r * zero))
     )
 
@@ -254,7 +254,7 @@ def _solved(
 def _searched(
     z: Float[Array, " free"], held: _Objective, tangents: _Objective
 ) -> tuple[Array, Array]:
-    """Return the optimum, and the Jacobian of the residuals with tangents for slopes there."""
+    """Return the optimum, and the Jacobian there of the residuals with `tangents` as arguments."""
     solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
     found = optx.least_squares(_residuals, solver, z, args=held, max_steps=200, throw=False)
     return found.value, jax.jacfwd(_residuals)(found.value, tangents)

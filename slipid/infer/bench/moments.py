@@ -1,7 +1,7 @@
 """Moments: sums of residuals times signals with independent noise, and the covariance of the sums.
 
 Let r be the residual of a window, and z the signals that the coefficients of its equation multiply,
-in its even (e) and its odd (o) rows. At the true numbers p
+in its even (e) and its odd (o) rows. At the true parameters p
 
     E g = 0,    g(p) = sum over windows of (w_e z_o r_e(p) + w_o z_e r_o(p)) / 2,
 
@@ -12,13 +12,12 @@ As r is linear in the coefficients k(p),
     g(p) = h - G k(p).
 
 Weights w of Student's t with 4 degrees of freedom reduce the effect of outliers. A weight depends
-on the residual only and not on the signals z that multiply it, whose noise would otherwise
-correlate with the weight. The uncertainty of k depends on G with the derivative of w r by r in
-place of w.
+on the residual r only and not on the signals z that multiply r: the noise of z would otherwise
+correlate with the weight. The uncertainty of k depends on G with d(w r)/dr in place of w.
 
 The covariance of the sum is S = sum_k (1 - |k| / K) sum_c g_c g_c+k^T over cells c of time (Newey
 and West 1987), where K is longer than the correlation time of residuals. Quantisation and a lasting
-misfit make it larger. A misfit over speed and current makes it larger, too: see `widened`.
+misfit make S larger. A misfit over speed and current makes S larger, too: see `widened`.
 """
 
 from collections.abc import Sequence
@@ -50,13 +49,13 @@ Square = Float[np.ndarray, "moment moment"]
 
 @dataclass(frozen=True, eq=False)
 class Equation:
-    """One of the two equations of a motor at given numbers k: its moments g = h - G k.
+    """One of the two equations of a motor at given coefficients k: its moments g = h - G k.
 
     Attributes:
         windows: windows of the records, with the signals of the equation.
         constant: h.
         slope: G.
-        tangent: -dg / dk with the change of weights, which determines the uncertainty of k.
+        tangent: -dg / dk, including the change of weights; it determines the uncertainty of k.
         residual: residual of every window [V] or [A], from its even and from its odd rows.
         weight: weight of every residual.
         terms: summand of every residual in g.
@@ -112,7 +111,7 @@ def equation(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signal
 
 
 def start(w: BenchWindows, count: int, rounds: int = 12) -> np.ndarray:
-    """Return coefficients at which the first `count` moments vanish; the other ones are 0."""
+    """Return coefficients for which the first `count` moments vanish; further ones are 0."""
     found = np.zeros(w.signals.shape[-1])
     weights = [w.usable.astype(float)] * 2
     for _ in range(rounds):
@@ -131,7 +130,7 @@ def _weighted(
 ) -> tuple[Float[np.ndarray, " window"], float, Float[np.ndarray, " window"]]:
     """Return the residuals of one half of the rows, their robust std, and their weights.
 
-    The std is at least 1e-9, the rounding errors of sums.
+    The std is at least 1e-9, the size of rounding errors in sums.
     """
     residual = w.measured[half] - w.signals[half] @ coefficients
     usable = np.abs(residual[w.usable])
@@ -185,8 +184,8 @@ def widened(s: Square, groups: Float[np.ndarray, "group moment"]) -> Square:
     """Return the larger of two covariances of a sum, along every direction.
 
     One is `s`, estimated from cells of time; the other is estimated from sums over groups of
-    windows with similar speed and current, less what chance explains. Both are equal for pure
-    noise, whereas a misfit over speed or current makes the second one larger.
+    windows with similar speed and current, divided by the largest excess that chance explains. For
+    pure noise, the first one is larger; a misfit over speed or current makes the second one larger.
     """
     root = np.linalg.cholesky(s + 1e-12 * np.diag(np.diag(s) + 1e-300))
     white = np.linalg.solve(root, groups.T)
@@ -200,7 +199,7 @@ def grouped(equation: Equation) -> Float[np.ndarray, "group moment"]:
     """Return sums of moments over groups of windows with similar speed and similar current.
 
     Groups have about equal sizes. A residual from even rows is grouped by the speed and current of
-    odd rows, and vice versa, so that its own noise does not determine its group.
+    odd rows, and vice versa, so that a residual's own noise does not determine its group.
     """
     w, total = equation.windows, np.zeros((SPEEDS * CURRENTS, equation.terms.shape[-1]))
     for half, terms in enumerate(equation.terms):

@@ -9,8 +9,8 @@ where speed, inertia and friction are those at the motor shaft, and the torque c
 back-EMF constant by conservation of energy. If the ammeter shows magnitudes, the zero I_0 is
 multiplied by the sign of the speed w.
 
-Both equations are linear in coefficients, which are functions of the numbers of the motor. The
-signals that they multiply are listed in `VOLTS` and `AMPS`.
+Both equations are linear in coefficients, which are functions of the motor's parameters. `VOLTS`
+and `AMPS` list the signals that these coefficients multiply.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,8 @@ BRUSH_CURRENT = 0.05
 REST = 2.5
 """Shaft speed w0 over which friction changes its sign [rad/s]."""
 VOLTS = ("current", "speed", "sign of the current", "slope of the current", "one", "along")
-"""Signals of the electrical equation; `along` is the sign given to unsigned currents, else 1."""
+"""Signals of the electrical equation; `along` is the sign given to unsigned currents, 1 for signed
+ones."""
 AMPS = ("slope of the speed", "sign of the speed", "speed", "along")
 """Signals of the mechanical equation; `along` as in `VOLTS`."""
 

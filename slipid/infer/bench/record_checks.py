@@ -12,9 +12,9 @@ from slipid.support.errors import DataError
 FEWEST_WINDOWS = 30
 """Smallest number of windows of an equation for a fit."""
 SURE_STDS = 5.0
-"""A column is refused if a coefficient has the wrong sign and is larger than this [std]."""
+"""A column is refused if a coefficient of wrong sign is larger than this in magnitude [std]."""
 FASTEST_SHAFT = 3000.0
-"""Brushed motors do not turn faster than this [rad/s]."""
+"""Shaft speed that brushed motors do not reach: a faster one shows a wrong unit [rad/s]."""
 LARGEST_POWER = 2e4
 """Power U^2 / R at standstill above which the current is assumed to be in milliamperes [W]."""
 
@@ -103,7 +103,7 @@ def _signs(
         )
     if back < -SURE_STDS and through > 0:
         found = "the voltage falls with speed: voltage and current seem to be exchanged"
-        _fail(where, found, "their columns exchanged")
+        _fail(where, found, "each of them in the column of the other")
 
 
 def _sure(w: BenchWindows, column: int) -> float:

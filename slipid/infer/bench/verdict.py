@@ -1,4 +1,4 @@
-"""Verdicts on motors of a bench: numbers with intervals, misfits, and remedies.
+"""Verdicts on motors of a bench: parameters with intervals, misfits, and remedies.
 
 A misfit is a dependence of residuals on speed, current or time.
 """
@@ -19,7 +19,7 @@ from slipid.support.content import Content
 from slipid.support.files import hash_of
 
 BINS = 8
-"""Number of bins over speed, current or time, with about equal counts of windows."""
+"""Number of bins over speed, current or time, with about equal numbers of windows."""
 MISFIT_STDS = 5.0
 """Smallest mean residual of a bin that is reported as a misfit [std of the mean]."""
 MISFIT_SHARE = 0.01
@@ -31,10 +31,10 @@ LONG_CORRELATION_S = 0.3
 
 
 def misfits(fit: MotorFit) -> dict[str, str]:
-    """Return a sentence on the largest misfit of each equation, by its channel.
+    """Return a sentence on the largest misfit of each equation, keyed by the equation's channel.
 
     A misfit is the largest mean residual over bins of speed, current or time. Equations without a
-    significant and large one are left out.
+    significant and large misfit are omitted.
     """
     return {e.channel: text for e in fit.equations if (text := _worst(fit, e)) is not None}
 
@@ -84,7 +84,7 @@ def _mean(
     length = max(fit.correlation_time, cell_length([w]))
     away = celled((sum_ - weight * off)[:, None], w, length)
     square = away[:, 0] ** 2
-    # no std can be estimated from too few cells of time, or if one cell outweighs all others
+    # A std estimated from few cells of time, or dominated by one cell, would not be reliable.
     if np.count_nonzero(square) < FEWEST_CELLS or square.max() > square.sum() / 2:
         return 0.0, 0.0
     return off, abs(off) * total / float(np.sqrt(square.sum()))
@@ -102,12 +102,12 @@ _NUMBERS_OF = {
         for name in ("coulomb_friction", "viscous_friction", "rotor_inertia", "current_offset")
     ),
 }
-"""Paths of the numbers that the equation of each channel determines."""
+"""Paths of the parameters that the equation of each channel determines."""
 ONE_SPEED_RATIO = 0.05
 """A log has a single operating point if its range of speeds, over the largest speed, is below
 this."""
 SLOW_ROWS_S = 1.0
-"""If the time between rows is longer, a message asks whether its unit is right [s]."""
+"""Time between rows above which a message asks whether the unit of time is right [s]."""
 _REMEDIES = (
     (
         ("motor.inductance",),
@@ -129,14 +129,14 @@ _REMEDIES = (
 
 @dataclass(frozen=True, eq=False)
 class BenchFit:
-    """Fitted numbers of the motors of a bench, with verdicts.
+    """Fitted parameters of the motors of a bench, with verdicts.
 
     Attributes:
         fits: fit of each motor.
-        parameters: numbers by path, with `@label` of a motor.
-        derived: quotients of numbers by path, with `@label` of a motor.
+        parameters: estimates, keyed by path, with `@label` of a motor.
+        derived: quotients of parameters, keyed by path, with `@label` of a motor.
         messages: warnings, one sentence each.
-        misfits: sentence on the misfit of each channel, by label of the motor.
+        misfits: sentences on misfits, keyed by label of the motor and by channel.
     """
 
     fits: tuple[MotorFit, ...]
@@ -214,7 +214,7 @@ def _remedy(paths: Sequence[str], has_voltage: bool) -> str:
 
 
 def _too_slow(f: MotorFit) -> dict[str, str]:
-    """Return a sentence, by path, for each number whose time constant is too short for the rows."""
+    """Return sentences, keyed by path, on parameters with time constants too short for the rows."""
     m, rows, slow = f.motor, f.period, {}
     if not f.has_voltage:
         return {}
@@ -253,7 +253,7 @@ def _with_verdict(
     """Return an estimate with a weaker verdict if the logs do not support its present one.
 
     Reasons are rows too far apart (`slow`), a single speed, an inductance near 0, and a misfit of
-    the number's equation.
+    the parameter's equation (`misfitted`).
     """
     if (e.path in slow or _one_point(f)) and e.verdict not in ("fixed", "not_identified"):
         return replace(e, verdict="not_identified", provenance="borrowed")
@@ -268,8 +268,8 @@ def _remarks(f: MotorFit) -> list[str]:
     found = []
     if _one_point(f):
         found.append(
-            "speed and voltage are constant, which does not determine any number: turn at "
-            "several speeds, in both directions, and accelerate and decelerate"
+            "speed and voltage are constant, so that no parameter is determined: turn at several "
+            "speeds, in both directions, and accelerate and decelerate"
         )
     if not f.has_voltage:
         found.append(
@@ -279,8 +279,8 @@ def _remarks(f: MotorFit) -> list[str]:
     if not all(r.signed for r in f.records):
         found.append(
             "currents are magnitudes: they were given the sign of the speed, windows in which "
-            "the motor may brake were left out, and the zero of the ammeter cannot be told from "
-            "friction"
+            "the motor may brake were not used, and the zero of the ammeter cannot be "
+            "distinguished from friction"
         )
     if f.period > SLOW_ROWS_S:
         found.append(
@@ -290,8 +290,8 @@ def _remarks(f: MotorFit) -> list[str]:
     if f.correlation_time > LONG_CORRELATION_S:
         found.append(
             f"residuals are correlated over {f.correlation_time:.2g} s: the intervals are "
-            f"computed from {f.independent_times:.0f} independent times of that length, not from "
-            "all rows"
+            f"computed from {f.independent_times:.0f} independent intervals of twice that time, "
+            "not from all rows"
         )
     if "motor.rotor_inertia" in f.space.slices:
         found.append("motor.rotor_inertia includes everything that turned together with the rotor")

@@ -10,9 +10,9 @@ One sum goes over the even rows of a window, another over the odd ones. Their se
 independent, so that the residual of one can be multiplied by the signals of the other without bias
 (`slipid.infer.bench.moments`).
 
-Windows with a gap in time are left out, as are those with a jump of the voltage inside or shortly
-before them: the time of the jump between two rows is unknown, and the current is not a straight
-line there.
+Windows with a gap in time are omitted, and so are windows with a jump of the voltage inside or
+shortly before: the time of the jump between two rows is unknown, and the current is not a straight
+line between rows there.
 """
 
 from collections.abc import Sequence
@@ -28,16 +28,16 @@ ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
 LEAST_ROWS, ENOUGH_ROWS = 2, 8
 """Smallest and desired half length of a window [row].
 
-The smallest one is needed for a slope from odd rows. Windows with fewer than the desired number of
-rows are lengthened to it, but not beyond those of the mechanical equation (`MECHANICAL_S`).
+A slope from odd rows needs at least `LEAST_ROWS`. Windows with fewer rows than `ENOUGH_ROWS` are
+lengthened to it, but not beyond the windows of the mechanical equation (`MECHANICAL_S`).
 """
 MOST_WINDOWS = 20_000
 """Largest number of windows of one record."""
 LONG_WINDOW_RATIO = 4
-"""Ratio of the length of longer windows, whose means give the signs of small currents, to that of
-windows."""
+"""Ratio of the length of the longer windows, whose means give the signs of small currents, to the
+length of windows."""
 GAP_RATIO = 1.5
-"""A window spans a gap between rows if its duration exceeds the nominal one by this ratio."""
+"""A window spans a gap between rows if its duration exceeds this multiple of the nominal one."""
 JUMP_STDS = 6.0
 """A larger step of the voltage between rows counts as a jump [robust std of steps]."""
 SETTLED_S, SETTLED_ROWS = 5e-3, 4
@@ -99,7 +99,7 @@ def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | No
 def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
     """Return windows of the mechanical equation [A]; they are not usable at rest.
 
-    At rest the friction may have any value up to that of motion.
+    The equation does not hold at rest, where friction may have any value up to that of motion.
     """
     parts = []
     for k, r in enumerate(records):
@@ -177,7 +177,7 @@ class _RecordWindows:
     def driven(self) -> Bool[np.ndarray, " window"]:
         """Return a mask of the windows in which unsigned currents have the right sign.
 
-        They were given the sign of the speed, which is wrong if the motor brakes.
+        Unsigned currents were given the sign of the speed, which is wrong if the motor brakes.
         """
         if self.record.signed:
             return np.ones(len(self.middle), bool)
@@ -189,7 +189,7 @@ class _RecordWindows:
     def places(
         self, number: int
     ) -> tuple[Float[np.ndarray, " window"], Int[np.ndarray, " window"]]:
-        """Return the time of every window [s], and the number of its record."""
+        """Return the time of every window [s], and the record's index `number` once per window."""
         time = self.record.time
         return time[self.middle] - time[0], np.full(len(self.middle), number)
 
@@ -202,7 +202,8 @@ def _jumps(
         return np.zeros(len(middle), bool)
     step = np.diff(r.voltage)
     away = np.abs(step - np.median(step))
-    # a mostly constant signal has median 0; steps below a thousandth of its range are no jumps
+    # The second limit keeps small steps of a mostly constant voltage, whose median step is 0, from
+    # counting as jumps.
     jump = away > JUMP_STDS * max(1.4826 * float(np.median(away)), 1e-3 * float(np.ptp(r.voltage)))
     rows = int(np.clip(round(SETTLED_S / r.period), 1, SETTLED_ROWS))
     count = np.concatenate([[0], np.cumsum(jump)])
@@ -212,5 +213,5 @@ def _jumps(
 def _joined(parts: Sequence[BenchWindows]) -> BenchWindows:
     """Return the windows of several records, one after the other."""
     fields = zip(*(vars(part).values() for part in parts), strict=True)
-    # windows are the first axis, or the second one behind the halves
+    # Windows are the first axis of a field, or the second one after the axis of halves.
     return BenchWindows(*(np.concatenate(x, axis=min(x[0].ndim, 2) - 1) for x in fields))

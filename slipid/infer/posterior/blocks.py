@@ -67,11 +67,11 @@ class Plan:
 
     Attributes:
         ensembles: number of independent ensembles.
-        walkers: number of walkers of each.
+        walkers: number of walkers of each ensemble.
         block: number of steps in a block.
-        warm_up: numbers of blocks after which proposals are learnt; the last one is the end of the
-            warm-up. Some blocks before it let the step of Hamiltonian moves adapt to the last
-            proposals.
+        warm_up: numbers of blocks after which proposals are learnt, except for the last number,
+            which ends the warm-up: the blocks before it let the step of Hamiltonian moves adapt to
+            the last proposals.
         most: number of blocks after which sampling ends even without convergence.
         spread: distance of the widest walker's start from the fit [std]; the first walker starts
             at a quarter of it. Wide starts find modes away from the fit.
@@ -125,7 +125,7 @@ class ChainBlock:
 
 
 def packed(block: ChainBlock) -> dict[str, np.ndarray]:
-    """Return the arrays of a block under their names in a file."""
+    """Return the arrays of a block, keyed by their names in a file."""
     return {
         "number": np.asarray(block.number),
         "chain": block.chain,

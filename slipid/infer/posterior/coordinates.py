@@ -16,7 +16,7 @@ from slipid.infer.result import Fit, required
 from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
-"""Parts of a posterior that have a density: motion, electric numbers given motion, all numbers."""
+"""Parts of a posterior: motion parameters, electric ones given the motion, all parameters."""
 _ROUNDS = 3
 """Number of alternations between weights of runs and shared effects at the fit."""
 
@@ -46,11 +46,11 @@ class Fitted:
 def coordinates(
     problem: Problem, fitted: Fitted, part: str
 ) -> tuple[Int[np.ndarray, " size"], Int[np.ndarray, " size"]]:
-    """Return index in the search vector, and group, of the coordinates of a part of the posterior.
+    """Return search-vector index and group of every coordinate of a part of the posterior.
 
-    The group is the index of the only floor whose residuals depend on the coordinate, -1 if there
-    are several or none; all coordinates are in the group of a single floor. The Jacobian at the
-    fit shows which floors each coordinate affects.
+    The group is the index of the only floor whose residuals depend on the coordinate, -1 if several
+    floors or none depend on it; if the robot has one floor only, all coordinates are in group 0.
+    The Jacobian at the fit shows which floors each coordinate affects.
     """
     _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
     surface = np.asarray(problem.batch.surface)
@@ -67,7 +67,7 @@ def coordinates(
 
 
 def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.ndarray, "segment 3"]:
-    """Return the shared effects at a fit, estimated by turns with the weights of runs."""
+    """Return the shared effects at a fit, estimated alternately with the weights of runs."""
     keep = np.ones(len(problem.windows))
     effect = np.zeros((len(keep), 3))
     for _ in range(_ROUNDS):
@@ -87,10 +87,10 @@ class Anchor(eqx.Module):
         root: whitening matrices of every block, for the noise variances of the fit.
         scale: square root of the weight of each segment, small for an outlier.
         log_det: log determinant of each segment's noise covariance.
-        shared: shared effects by floor.
+        shared: shared effects of each floor.
         effects: posterior of the shared effects, given residuals whitened by root and scale.
         twist: twist of every window at the fit.
-        twist_slope: derivative of the twists by the search vector.
+        twist_slope: derivative of the twists with respect to the search vector.
         electric: noise that predictions of voltages depend on, with the fitted resistance.
     """
 
@@ -139,7 +139,7 @@ class Anchor(eqx.Module):
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:
-        """Return a robot's prediction, with the root finder started near the fit's twists."""
+        """Return a robot's prediction; the search for twists starts near those of the fit."""
         return lk.predict(robot, self.batch, self.twist + self.twist_slope @ (z - self.z))
 
     def noise(self, robot: Robot) -> lk.ElectricNoise:

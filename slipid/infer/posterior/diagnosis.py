@@ -55,17 +55,17 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Posterior of a fit; `print` shows its numbers and the convergence of its chains.
+    """Posterior of a fit; `print` shows its parameters and the convergence of its chains.
 
     Attributes:
         fit: fit around which the chains were started.
         z: draws of the search vector.
         log_variance: draws of the log variances.
-        log_prob: log density of the numbers that were sampled by chains: all of them, or those of
-            the motion if currents were logged.
-        names: names of the numbers that were sampled by chains.
+        log_prob: log density of the parameters that were sampled by chains: all parameters, or the
+            motion parameters if currents were logged.
+        names: names of the coordinates that were sampled by chains.
         diagnosis: convergence of the chains.
-        accepted: fraction of accepted moves, by part.
+        accepted: fraction of accepted moves, keyed by part of the posterior.
         converged: True if the chains converged and nearly all electric draws had an accepted
             proposal.
         reason: value of the criterion that is furthest from being met, as text.
@@ -89,7 +89,7 @@ class Posterior:
 
     @cached_property
     def parameters(self) -> dict[str, verdicts.Estimate]:
-        """Numbers by path, with mean, interval and verdict from the draws."""
+        """Parameters, keyed by path, with mean, interval and verdict from the draws."""
         return estimates(self.fit, self.z)
 
     @property
@@ -99,15 +99,15 @@ class Posterior:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Warnings about the numbers, one sentence each."""
+        """Warnings about the fit and the convergence of its chains, one sentence each."""
         warning = f"the posterior did not converge: {self.reason}"
         return self.fit.messages + (() if self.converged else (warning,))
 
     def draws(self, path: str) -> Float[np.ndarray, "ensemble draw *number"]:
-        """Return draws of a free number [SI], a row per ensemble, early steps first.
+        """Return draws of a free parameter [SI], one row per ensemble, early steps first.
 
         Raises:
-            KeyError: the number does not exist or is fixed; the message lists all.
+            KeyError: the parameter does not exist or is fixed; the message lists all free ones.
         """
         space = self.fit.space
         if path not in space.slices:
@@ -124,13 +124,13 @@ class Posterior:
         return netcdf.tree(self)
 
     def plot(self, name: str = "intervals") -> "Figure":
-        """Draw one of the posterior's pictures.
+        """Draw one of the posterior's figures.
 
         Args:
-            name: `intervals` of every number, or `pairs` with the most curved dependence.
+            name: `intervals` of every parameter, or `pairs` with the most curved dependence.
 
         Raises:
-            ValueError: the picture does not exist.
+            ValueError: there is no such figure.
         """
         from slipid.plots.posterior import FIGURES
 
@@ -190,7 +190,7 @@ def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
     about = chain - chain.mean(axis=(0, 1, 2))
     spectrum = np.abs(np.fft.rfft(about, 2 * steps, axis=1)) ** 2
     covariance = np.fft.irfft(spectrum.mean(axis=(0, 2)), axis=0)[:steps]
-    # each lag has its own number of pairs
+    # The sum at a lag has as many terms as pairs of steps, which decrease with the lag.
     correlation = covariance / np.arange(steps, 0, -1)[:, None]
     sums = 2 * np.cumsum(correlation / correlation[0], axis=0) - 1
     enough = np.arange(steps)[:, None] >= 5 * sums
@@ -201,10 +201,10 @@ def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
 def estimates(
     fit: Fit, draws: Float[np.ndarray, "ensemble draw free"]
 ) -> dict[str, verdicts.Estimate]:
-    """Return every number with mean, interval and verdict from the draws of a posterior.
+    """Return every parameter with mean, interval and verdict from the draws of a posterior.
 
-    Means are taken in the search space, so that shares sum to one and means of positive numbers are
-    geometric. Flat directions are those of the fit.
+    Means are taken in the search space, so that load fractions sum to one and means of positive
+    parameters are geometric. Flat directions are those of the fit.
     """
     every, flat = draws.reshape(-1, fit.space.size), members(fit.flat)
     out, space = dict(fit.parameters), fit.verdict_space
@@ -223,7 +223,7 @@ def estimates(
 
 
 def identified(found: Posterior) -> Content:
-    """Return the content of identified.json with the numbers of the posterior."""
+    """Return the content of identified.json with the estimates of the posterior."""
     fit, flat = found.fit, found.flat
     content = identified_json(fit)
     for path, e in found.parameters.items():

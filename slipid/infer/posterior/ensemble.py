@@ -31,15 +31,15 @@ TARGET_ACCEPTED = 0.8
 FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
 """First and smallest step of Hamiltonian moves [rad]."""
 DRAWS_PER_EFFECTIVE = 20.0
-"""Approximate number of warm-up draws with the information of one independent draw."""
+"""Approximate number of warm-up draws that carry the information of one independent draw."""
 
 
 def extended(
     target: LogDensity, plan: Plan, part: str, checkpoint: Checkpoint | None, report: Reporter
 ) -> list[ChainBlock]:
-    """Return the blocks of a part, sampled until convergence or the plan's limit of blocks.
+    """Sample blocks of a part of the posterior until convergence or the plan's limit of blocks.
 
-    Sampling continues after the blocks in the checkpoint, in which each new block is stored.
+    Sampling resumes after the blocks in the checkpoint, in which each new block is stored.
     """
     blocks: list[ChainBlock] = []
     while checkpoint and (arrays := checkpoint.load(f"{part}-{len(blocks):04d}")) is not None:
@@ -58,9 +58,9 @@ def extended(
             f"{100 * block.accepted.mean():.0f} % moved, "
             f"log density {block.log_prob[:, -1].mean():.1f}"
         )
-        report.advance(
-            len(blocks), plan.most, what
-        )  # The remaining time is estimated up to the limit of blocks.
+        # The block at which sampling converges is unknown, so the remaining time is estimated for
+        # the limit of blocks.
+        report.advance(len(blocks), plan.most, what)
     return blocks
 
 
@@ -75,12 +75,12 @@ def _ended(blocks: list[ChainBlock], plan: Plan) -> bool:
 
 
 def chain(blocks: Sequence[ChainBlock], plan: Plan) -> Chain:
-    """Return the positions after the warm-up."""
+    """Return the positions of all walkers after the warm-up."""
     return np.concatenate([b.chain for b in blocks[plan.warm_up[-1] :]], axis=1)
 
 
 def _block(target: LogDensity, plan: Plan, blocks: list[ChainBlock]) -> ChainBlock:
-    """Return the next block of a chain, its ensembles sampled in threads side by side."""
+    """Sample the next block of a chain; the ensembles run in parallel threads."""
     states, map, angle = _begin(target, plan, blocks)
     stop = threading.Event()
 
@@ -136,7 +136,7 @@ def _block(target: LogDensity, plan: Plan, blocks: list[ChainBlock]) -> ChainBlo
 def _begin(
     target: LogDensity, plan: Plan, blocks: list[ChainBlock]
 ) -> tuple[list[State], Transport, np.ndarray]:
-    """Return the state of every ensemble in mapped coordinates, the map, and the angles."""
+    """Return every ensemble's state in mapped coordinates, the map, and Hamiltonian steps [rad]."""
     if not blocks:
         map = target.laplace()
         starts = [_start(target, plan, k) for k in range(plan.ensembles)]
@@ -162,7 +162,7 @@ def _start(target: LogDensity, plan: Plan, ensemble: int) -> tuple[np.ndarray, R
     x = np.empty((plan.walkers, len(root)))
     lost = np.ones(plan.walkers, bool)
     for shrink in 0.7 ** np.arange(30):
-        # all walkers are drawn each time, so that the density is compiled for one shape only
+        # All walkers are drawn in each try: a smaller array would compile the density once more.
         tried = target.centre + shrink * wide * random.standard_normal(x.shape) @ root.T
         found = np.isfinite(target.terms(tried)).all(axis=1)
         x[lost & found] = tried[lost & found]
@@ -181,9 +181,10 @@ def _with_learnt(
     blocks: list[ChainBlock],
     turns: list[list[float]],
 ) -> ChainBlock:
-    """Return the block with the map and the angles for the next one, adapted during the warm-up.
+    """Return the block with the map and Hamiltonian steps of the next block.
 
-    `turns` holds the fractions of accepted Hamiltonian moves, by family.
+    Both are adapted during the warm-up only. `turns` holds, for each family, the fractions of
+    accepted Hamiltonian moves.
     """
     count = block.number + 1
     if count > plan.warm_up[-1]:

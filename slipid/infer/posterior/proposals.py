@@ -2,8 +2,9 @@
 
 A target's log density is a sum of one term per group of coordinates, given the coordinates that
 groups share, and a term of the shared coordinates. Moves are made in the coordinates of
-`transport_map`. A move changes either all groups in one evaluation, each of which is accepted or
-rejected by its own term, or the shared coordinates, with the groups fixed relative to them.
+`transport_map`. A move changes either all groups in one evaluation, where each group is accepted or
+rejected by its own term, or the shared coordinates, while the mapped coordinates of groups stay
+fixed.
 Independence moves and differential evolution are efficient where the map is accurate, Hamiltonian
 moves along the gradient also where it is not; walks along single coordinates cross plateaus of the
 density.
@@ -36,9 +37,9 @@ ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 0.8
 A Hamiltonian move takes six times longer, but it moves walkers away from where the map is wrong.
 """
 ALONE_SHARE = 0.5
-"""Fraction of coordinate walks that leave all other coordinates of x unchanged."""
+"""Fraction of coordinate walks that leave all other coordinates of x, not of u, unchanged."""
 _FINITE = 1e100
-"""Bound of slopes, so that their squares are finite."""
+"""Bound of the changes of momentum, so that their squares are finite."""
 STEEPEST = 50.0
 """Largest change of momentum in a Hamiltonian step.
 
@@ -51,7 +52,7 @@ class Family:
 
     Attributes:
         places: indices of the coordinates, one array per group.
-        groups: group of each array, None for the coordinates that groups share.
+        groups: group of each array, None if the family is the shared coordinates.
     """
 
     places: tuple[Int[np.ndarray, " _"], ...]
@@ -145,7 +146,7 @@ def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
 class DifferentialEvolution(FamilyMove):
     """Differential evolution: steps along scaled differences of two fixed walkers.
 
-    The fraction `whole` of the steps is a whole difference, which can lead from one mode to
+    A fraction `whole` of the steps is an unscaled difference, which can lead from one mode to
     another. Source: ter Braak 2006, Statistics and Computing 16.
     """
 
@@ -165,9 +166,9 @@ class DifferentialEvolution(FamilyMove):
 class CoordinateWalk(FamilyMove):
     """Random walk of one coordinate of x in each group, or of one shared coordinate.
 
-    If data only show that a number is small, the density of its logarithm has a plateau. No map
-    makes it Gaussian, but this walk crosses it. The coordinates that stay fixed are the other ones
-    of x, or the other ones of u, in which case those of x change by the map.
+    If data only show that a parameter is small, the density of its logarithm has a plateau. No map
+    makes this density Gaussian, but the walk crosses the plateau. Either all other coordinates of x
+    stay fixed, or all other coordinates of u; x then changes along with the map.
     """
 
     def __init__(self, target: LogDensity, groups: tuple[int, ...] | None):
@@ -202,9 +203,10 @@ class Hamiltonian(FamilyMove):
 
         turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
 
-    Groups are independent while the shared coordinates are fixed, so that each has a trajectory of
-    its own, which is accepted or rejected by itself. If a slope on a walker's trajectory is not
-    finite, all its groups return to the start, as any of them may be the cause.
+    Groups are independent while the shared coordinates are fixed, so that each group has a
+    trajectory of its own, which is accepted or rejected separately. If a slope on a walker's
+    trajectory is not finite, all groups of the walker return to their start, as any group may be
+    the cause.
 
     Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
     """
@@ -253,7 +255,7 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
 def moves(target: LogDensity, angles: Float[np.ndarray, " family"]) -> list[tuple[Move, float]]:
     """Return moves in the target's coordinates with their relative frequencies.
 
-    Angles are the steps of the Hamiltonian moves of every family [rad].
+    `angles` holds the step of the Hamiltonian moves of each family [rad].
     """
     of_family = families(target)
     found: list[tuple[Move, float]] = []

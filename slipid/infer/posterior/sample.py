@@ -3,8 +3,8 @@
 Where currents were logged the posterior is p(motion | motion data) p(electric | motion, data). Its
 density cannot be evaluated, since the normalising constant of the second factor depends on the
 motion. Therefore the motion is sampled first. Given the motion, the residuals are nearly linear in
-the electric numbers, which are drawn by Metropolis-Hastings steps with proposals around their most
-likely values.
+the electric parameters, which are drawn by Metropolis-Hastings steps with proposals around their
+most likely values.
 """
 
 import importlib
@@ -35,13 +35,12 @@ from slipid.support.checkpoint import Checkpoint
 from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
+# These packages are needed at the end: a missing one is reported here, not after hours of sampling.
 for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
-    importlib.import_module(
-        _module
-    )  # A missing package must be reported here, not after hours of sampling.
+    importlib.import_module(_module)
 
 MOST_UNMOVED = 0.01
-"""Largest accepted fraction of draws whose electric numbers have no accepted proposal."""
+"""Largest tolerated fraction of draws whose electric parameters have no accepted proposal."""
 
 
 def sampled(
@@ -49,10 +48,10 @@ def sampled(
 ) -> Posterior:
     """Return the posterior sampled around a fit, with `draws` draws from each ensemble.
 
-    Sampling continues after the blocks that an earlier call has stored in the checkpoint.
+    Sampling resumes after the blocks that an earlier call has stored in the checkpoint.
     """
     problem, fitted = required(fit.problem), Fitted.of(fit)
-    assert problem.multi_floor is None, "runs on one floor each"
+    assert problem.multi_floor is None, "sampling needs a fit of runs on one floor each"
     parts = (EVERYTHING,) if problem.objective.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     target = LogDensity(first.terms, first.slope, first.group, first.centre, first.covariance)
@@ -93,9 +92,9 @@ def sampled(
 def thinned(
     chain: Chain, blocks: Sequence[ChainBlock], draws: int
 ) -> tuple[Float[np.ndarray, "ensemble draw size"], Float[np.ndarray, "ensemble draw"]]:
-    """Return positions and log densities of draws spread evenly over steps and walkers.
+    """Return positions and log densities of `draws` draws, spread evenly over steps and walkers.
 
-    Draws are repeated if the chain has fewer steps than draws.
+    Steps are used repeatedly if the chain has fewer steps than draws.
     """
     log_prob = np.concatenate([b.log_prob for b in blocks], axis=1)
     _, steps, walkers, _ = chain.shape
@@ -107,10 +106,11 @@ def thinned(
 def drawn_variances(
     problem: Problem, fitted: Fitted, shape: tuple[int, int], seed: int
 ) -> Float[np.ndarray, "ensemble draw variance"]:
-    """Return draws of log variances from the Gaussian with their expected information at the fit.
+    """Return draws of the log variances, which stay fixed in the chains.
 
-    They hardly depend on the numbers of the model, so that they are fixed in the chains. The
-    variance of the load biases, of which there are few, is drawn from its posterior on a grid.
+    The log variances depend little on the parameters of the model. They are drawn from a Gaussian
+    around the fit with their expected information. The variance of the load biases, of which there
+    are few, is drawn from its posterior on a grid instead.
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
@@ -190,7 +190,7 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
 
 
 def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
-    """Return draws of every quantity with a free number, and its dimensions and unit, by name."""
+    """Return draws, dimensions and units of every quantity with a free parameter, keyed by it."""
     shape = found.z.shape[:2]
     robots = jax.vmap(space.tree)(jnp.asarray(found.z.reshape(-1, space.size)))
     values, dims, units = {}, {}, {}
@@ -205,9 +205,9 @@ def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
 
 
 def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
-    """Return draws of every noise component's std, and their dimensions, by name.
+    """Return draws of the std of every noise component, and their dimensions, keyed by name.
 
-    Components of floors are joined to one array with the dimension `surface`.
+    The same component of several floors is one array with the dimension `surface`.
     """
     rows = np.moveaxis(np.exp(0.5 * found.log_variance), -1, 0)
     labels = problem.robot.surfaces.labels
@@ -218,7 +218,7 @@ def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
         if component.floor is None:
             stds[name], dims[name] = std, []
             continue
-        # a floor with a single session has no session component: its std is zero
+        # The array starts at zero, as a floor with a single session has no session component.
         whole = stds.setdefault(name, np.zeros((*std.shape, len(labels))))
         whole[..., labels.index(component.floor)], dims[name] = std, ["surface"]
     return stds, dims
@@ -227,10 +227,10 @@ def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
 def _data(
     problem: Problem, found: Posterior, new: dict[str, np.ndarray]
 ) -> tuple[dict, dict, dict]:
-    """Return the measurements of every window, their replicates, and their dimensions, by name.
+    """Return measurements of all windows, their replicates and dimensions, keyed by channel.
 
     `new` contains replicates less measurements. Marker increments are in metres corrected by the
-    fitted camera.
+    fitted camera model.
     """
     w = problem.windows
     middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
@@ -264,7 +264,7 @@ def _replicates(
 ) -> dict[str, Float[np.ndarray, "ensemble replicate segment m"]]:
     """Return replicated less measured data of every segment, for `REPLICATES` draws per ensemble.
 
-    They are predicted less measured data, plus noise with the variances of the same draw.
+    A replicate is the prediction of a draw plus noise with the variances of the same draw.
     """
     picked = np.linspace(0, x.shape[1] - 1, REPLICATES).astype(int)
     some, noise = x[:, picked], log_variance[:, picked].reshape(-1, log_variance.shape[-1])

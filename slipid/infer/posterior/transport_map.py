@@ -13,8 +13,8 @@ and Pewsey 2009, Biometrika 96, eq. 2) leads from v to u, coordinate by coordina
     sinh(tail arcsinh((v - place) / scale) - skew)
 
 The map of a group depends on the shared coordinates and on the group itself only, so that groups
-that are independent given the shared coordinates remain independent. It is one of the maps of
-Marzouk et al. 2016 (Sampling via measure transport, section 3).
+that are independent given the shared coordinates remain independent. Triangular maps of this kind
+are described by Marzouk et al. 2016 (Sampling via measure transport, section 3).
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ Vector = Float[np.ndarray, " _"]
 Leaf = Array | np.ndarray
 """A NumPy array while a map is learnt, a JAX array in the inverse map."""
 POLYNOMIAL_LIMIT = 4.0
-"""Size of a whitened coordinate w beyond which polynomials are constant [std]."""
+"""Magnitude of a whitened coordinate w above which polynomials are constant [std]."""
 SQUARED_COORDINATES = 5
 """Number of coordinates of a group, with the largest variances, whose squares and products are
 monomials."""
@@ -113,8 +113,8 @@ def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
 class Transport:
     """Map of vectors x (row, size) to u (row, size), and its inverse, one coordinate per step.
 
-    Steps of the inverse work on a matrix with the columns of all w, of all x - m, which are zero
-    until their step, and a column of ones:
+    The inverse works on a matrix with a column for each w_i, one for each x_i - m_i, and a column
+    of ones. Step i sets the columns of w_i and x_i - m_i, which are zero before:
 
         w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
 
@@ -158,12 +158,12 @@ class Transport:
         return self.last.forward(v)
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
-        """Return the coordinates x of u, and log |dx/du| as a sum over coordinates (row, size)."""
+        """Return the coordinates x of u, and the terms (row, size) that add up to log |dx/du|."""
         x, log = _placed(self._on_device, u)
         return np.array(x), np.array(log)
 
     def pulled_back(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
-        """Return the gradient by u of log |dx/du| + f(x), given the gradient `slope` of f."""
+        """Return the gradient of log |dx/du| + f(x) with respect to u, given `slope` = df/dx."""
         return np.array(_pulled(self._on_device, u, slope(self.placed(u)[0])))
 
     @cached_property
@@ -208,8 +208,8 @@ def _monomials(
 ) -> tuple[Int[np.ndarray, "coordinate monomial 3"], Matrix, Matrix]:
     """Return the polynomials a and b of each coordinate, fitted to draws w of a group.
 
-    They are given by the factors of their monomials, indices of columns of (w, 1), and the
-    coefficients of a and of b. The draws count as `effective` independent ones.
+    The polynomials are given by the factors of their monomials, which are indices of columns of
+    (w, 1), and by the coefficients of a and of b. The draws count as `effective` independent draws.
     """
     size = w.shape[1]
     one = size  # the column of ones
@@ -251,7 +251,7 @@ def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]
             by = f[:, means].T * weight
             shift[means] = np.linalg.solve(by @ f[:, means], by @ w)
             excess = (w - f @ shift) ** 2 * weight - 1
-            # Fisher's information of a log std is 2
+            # This is a scoring step: each row has the Fisher information 2 about its log std.
             of = f[:, spreads]
             step = np.linalg.solve(2 * of.T @ of, of.T @ excess)
             scale[spreads] += step * min(1.0, 1.0 / (np.abs(of @ step).max() + 1e-9))
@@ -285,11 +285,11 @@ def gaussian(
     draws: Matrix | None = None,
     effective: float = 0.0,
 ) -> Transport:
-    """Return the linear map of a Gaussian, or with draws a map with the polynomials learnt from it.
+    """Return the linear map of a Gaussian, or a map with polynomials learnt from `draws`.
 
     Shared coordinates come first, then group by group. Coordinates with the largest conditional
-    variance at the mode come first in a group: at the mode these are the ones along a curved
-    valley, whereas draws have large variances across it as well.
+    variance at the mode come first in a group: at the mode, these coordinates point along a curved
+    valley, whereas draws have large variances across the valley as well.
 
     Args:
         mean: mean of x.
@@ -297,7 +297,7 @@ def gaussian(
         group: group of each coordinate, -1 if shared.
         at_mode: covariance at the mode, that of the Gaussian by default.
         draws: draws from which the polynomials of groups are learnt.
-        effective: number of independent draws that they count as.
+        effective: number of independent draws that `draws` count as.
     """
     size, shared = len(mean), np.flatnonzero(group < 0)
     slope, root, order = np.zeros((size, 2 * size + 1)), np.zeros(size), np.zeros(0, int)
@@ -324,7 +324,7 @@ def gaussian(
 
 
 def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Matrix]:
-    """Return the slope of own coordinates by given ones, and their conditional covariance."""
+    """Return the regression slopes of `own` on `given`, and the conditional covariance of `own`."""
     cross = covariance[np.ix_(given, own)]
     slope = np.linalg.solve(covariance[np.ix_(given, given)], cross)
     return slope, covariance[np.ix_(own, own)] - cross.T @ slope
@@ -333,8 +333,8 @@ def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matr
 def learnt(draws: Matrix, effective: float, covariance: Matrix, group: np.ndarray) -> Transport:
     """Return the map learnt from draws (draw, size), which count as `effective` independent ones.
 
-    The Laplace covariance is averaged in, with the weight of as many draws as there are
-    coordinates.
+    The covariance of the draws is averaged with the Laplace covariance, which has the weight of as
+    many independent draws as there are coordinates.
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
     size, mean = some.shape[1], some.mean(axis=0)

@@ -19,7 +19,7 @@ def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     table(tmp_path / "grass" / "run2.csv", plain(9.0))
     draft, config = proposed(tmp_path, **ROBOT)
     (question,) = config.questions  # what no log without voltages tells
-    assert question.startswith('"motor.resistance": without the voltages')
+    assert question.startswith('"motor.resistance": no motor voltages')
     assert config.text.replace('"# ?"', "").count(QUESTION_MARK) == 1
     layout = layout_in(config)
     assert layout["columns"]["wheel_speed"] == {
@@ -230,7 +230,7 @@ def test_currents_without_voltages_ask_for_the_datasheet(tmp_path):
         with_voltage[f"motor_voltage_{side}"] = 2.0 * with_voltage[f"{side}_vel"]
     for columns, asked in ((plain(), True), (with_voltage, False)):
         _, config = proposed(table(tmp_path / "run.csv", columns), **ROBOT)
-        assert any("by the datasheet?" in q for q in config.questions) is asked
+        assert any("in the datasheet?" in q for q in config.questions) is asked
 
 
 def test_a_log_of_a_motor_on_a_bench_is_sent_to_the_command_for_it(tmp_path):

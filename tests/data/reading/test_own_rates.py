@@ -177,7 +177,7 @@ def test_files_beside_each_other_are_one_run(tmp_path, epoch, quaternion):
 def test_a_file_that_should_lie_beside_is_named_with_what_does(tmp_path):
     beside(tmp_path / "run1")
     (tmp_path / "run1" / "mocap.csv").rename(tmp_path / "run1" / "camera.csv")
-    with pytest.raises(DataError, match=r"mocap.csv: missing.*which has camera.csv"):
+    with pytest.raises(DataError, match=r"mocap.csv: missing.*the folder has camera.csv"):
         one(tmp_path, layout_beside(), "*/joint_states.csv")
 
 

@@ -257,7 +257,9 @@ def test_parquet_reads_as_csv_does(root):
     with pytest.raises(DataError, match=r"run.parquet row 1, column 'left_rpm': no such column"):
         read_log(path, layout)
     path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(DataError, match=r"run.parquet: no Parquet.*expected a whole Parquet file"):
+    with pytest.raises(
+        DataError, match=r"run.parquet: not Parquet.*expected a complete Parquet file"
+    ):
         read_log(path, layout)
 
 

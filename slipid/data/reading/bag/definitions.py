@@ -31,7 +31,7 @@ _SEPARATOR = "=" * 80 + "\n"
 
 @dataclass(frozen=True)
 class ArrayType:
-    """Type of an array of `count` elements; None if the count differs between messages."""
+    """Type of an array of `count` elements; `count` is None if it differs between messages."""
 
     element: FieldType
     count: int | None

@@ -170,7 +170,7 @@ def _channel_problem(name: str, channel: TopicChannel) -> str | None:
             return None
         inner = ", ".join(GROUPS[name])
         return (
-            "keys other than topic and field; expected these two alone, or separate entries for "
+            "keys other than topic and field; expected only these two, or separate entries for "
             f"{inner}"
         )
     if name not in PER_WHEEL and len(channel.topics) > 1:

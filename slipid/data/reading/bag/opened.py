@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from slipid.data.reading.bag.definitions import MessageType, definition_of
 from slipid.data.reading.bag.shape import MessageShape, shape_of
-from slipid.data.reading.bag.storage import BagFiles, RepairedMcap, files_of, repaired
+from slipid.data.reading.bag.storage import OPENABLE, BagFiles, RepairedMcap, files_of, repaired
 from slipid.support.errors import DataError, bad_data
 
 if TYPE_CHECKING:
@@ -63,19 +63,19 @@ class BagTopic:
         return ((received, data) for _, received, data in self.bag.messages([self.name]))
 
     def shape(self, data: bytes, number: int) -> MessageShape:
-        """Return the shape of a message; raise `DataError` if it does not match its definition.
+        """Return the byte layout of a message; raise `DataError` if it contradicts its definition.
 
         `number` is the number of the message in the topic, from 1.
         """
         try:
             return shape_of(data, self.message, cdr=self.bag.files.storage != "rosbag1")
         except ValueError as error:
-            found = f"it is no {self.message.name}: {error}"
+            found = f"the message is no {self.message.name}: {error}"
             expected = "messages that match their definition; is the bag damaged?"
             raise self.error(found, expected, number) from error
 
     def shapes(self) -> Iterator[MessageShape]:
-        """Yield the shape of each message."""
+        """Yield the byte layout of each message."""
         for number, (_, data) in enumerate(self.messages(), start=1):
             yield self.shape(data, number)
 
@@ -220,7 +220,7 @@ def damage_error(files: BagFiles, error: Exception) -> DataError:
         expected = f"a whole bag; {_REMEDY['rosbag1'].format(file=file)}"
         return bad_data(files.path, "the bag has no index: its recording was cut off", expected)
     if isinstance(error, PermissionError):
-        return bad_data(files.path, f"cannot be read ({error.strerror})", "a readable bag")
+        return bad_data(files.path, f"cannot be read ({error.strerror})", OPENABLE)
     if isinstance(error, KeyError) and error.args[0] in ("protobuf", "jsonschema", "flatbuffer"):
         found = f"it contains messages encoded as {error.args[0]}, which cannot be read"
         expected = "ROS messages only; remove the others with: mcap filter"

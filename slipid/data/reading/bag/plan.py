@@ -30,8 +30,8 @@ _KNOWN: dict[str, dict[str, tuple[str, str]]] = {
     },
     "PowerReadings": {"bus_voltage": ("voltage", "V"), "current": ("current", "A")},
 }
-"""Path and unit of known fields by channel, by name of the message type. The name has no package if
-several packages have a copy of the type."""
+"""Path and unit of known fields, keyed by message type and then by channel. A type is named without
+its package if several packages have a copy of it."""
 _INSIDE = {
     "pose": ("pose.pose.", "pose.", "transform.", ""),
     "twist_command": ("twist.twist.", "twist.", ""),
@@ -63,8 +63,8 @@ class ChannelPlan:
 
     Attributes:
         channel: name of the channel, pose or twist in the layout.
-        spec: position of the channel in the layout.
-        wanted: the numbers to take from the messages of each topic, by the name of the topic.
+        spec: entry of the channel in the layout.
+        wanted: name of each topic, with the numbers to take from its messages.
         unit: unit of the numbers; empty for a pose or a twist, whose numbers are in SI units.
         links: chain of transforms that a pose is composed of; empty for other channels and poses.
     """
@@ -80,8 +80,8 @@ def plan(bag: OpenBag, layout: BagLayout) -> tuple[ChannelPlan, ...]:
     """Return the plan of every channel of a layout.
 
     Raises:
-        DataError: a topic is missing or empty, its messages do not fit the channel, or their type
-            has no definition.
+        DataError: a topic is missing or empty, its messages do not contain the channel, or their
+            type has no definition.
     """
     return tuple(_planned(bag, layout, name, spec) for name, spec in layout.topics.items())
 
@@ -159,7 +159,7 @@ def _serves(topic: BagTopic, channel: str) -> bool:
 
 
 def fits(channel: str, message: MessageType) -> bool:
-    """Return whether messages of a type contain a channel, with no setting needed but the topic."""
+    """Return whether messages of a type contain a channel for which a layout needs only a topic."""
     if channel == "pose" and is_transforms(message):
         return True
     if channel in GROUPS:
@@ -176,7 +176,7 @@ def is_transforms(message: MessageType) -> bool:
 
 
 def _known(message: MessageType) -> dict[str, tuple[str, str]]:
-    """Return path and unit of the known fields of a type, by channel."""
+    """Return path and unit of the known fields of a type, keyed by channel."""
     return _KNOWN.get(message.name) or _KNOWN.get(message.name.rsplit("/", 1)[-1], {})
 
 
@@ -218,7 +218,8 @@ def _field_pick(channel: str, spec: TopicChannel, topic: BagTopic) -> tuple[Pick
     """Return the pick of a channel by paths of fields, and the unit of the numbers.
 
     Raises:
-        DataError: the type does not fit, or a field or a unit must be given in the layout.
+        DataError: the type does not have the field, the field has no numbers, or the layout must
+            give a field or a unit.
     """
     message = topic.message
     known = _known(message)
@@ -252,7 +253,7 @@ def _joint_pick(
 ) -> tuple[Pick, str]:
     """Return the pick of a channel from an array of JointState messages, and the numbers' unit.
 
-    Without a field in the layout it is the array that most likely contains the channel.
+    Without a field in the layout, the array that most likely contains the channel is taken.
     """
     likely = "velocity" if "_speed" in channel else "effort"
     array = "position" if channel.endswith("_angle") else likely
@@ -274,7 +275,7 @@ def _joint_pick(
 
 
 def _check_unit(channel: str, path: str, unit: str, topic: BagTopic) -> None:
-    """Raise `DataError` if the unit of a field does not fit the channel."""
+    """Raise `DataError` if the unit of a field cannot be converted to that of the channel."""
     try:
         factor(unit, CHANNELS[channel])
     except ValueError as error:

@@ -89,7 +89,7 @@ def run_spans(
 def _sampled(signals: Mapping[str, Signal], span: RunSpan) -> bool:
     """Return whether every signal of the wheels has two samples in a run.
 
-    Without signals of the wheels, every signal must have them.
+    Without signals of the wheels, every signal must have two samples in the run.
     """
     moving = [signals[name] for name in TURNS if name in signals] or list(signals.values())
     ends = [np.searchsorted(signal.time, (span.start, span.end)) for signal in moving]
@@ -150,7 +150,7 @@ def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray
 
 
 def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
-    """Return the samples at which an angle has changed by `LEAST_MOTION` since the last one.
+    """Return the samples at which an angle differs by `LEAST_MOTION` from the last such sample.
 
     Therefore noise, or an encoder that alternates between two ticks, does not count as motion. The
     angle is in rad.

@@ -1,8 +1,8 @@
-"""Positions of numbers in the bytes of serialised messages.
+"""Byte offsets of the numbers in serialised messages.
 
-Most messages of a topic have the same shape: equal texts, and arrays of equal lengths. So one
-message is decoded field by field, and the numbers of all others with the same shape are taken from
-the same byte positions, thousands of messages at a time.
+Most messages of a topic have the same byte layout: equal texts, and arrays of equal lengths. So one
+message is decoded field by field, and the numbers of all other messages with the same byte layout
+are taken from the same offsets, thousands of messages at a time.
 
 A path names a field, such as `motors[0].current`; without an index it stands for all elements.
 """
@@ -36,7 +36,7 @@ def without_indices(path: str) -> str:
 
 @dataclass(frozen=True)
 class BytePlace:
-    """Position of a number in a message: its first byte, and its numpy type with byte order."""
+    """Offset of a number's first byte in a message, and its numpy type with byte order."""
 
     offset: int
     dtype: str
@@ -44,7 +44,10 @@ class BytePlace:
     def of(
         self, block: UInt8[np.ndarray, "message byte"], kind: type = float
     ) -> Num[np.ndarray, " message"]:
-        """Return the number in each message of a block, all of one shape, as another type."""
+        """Return the number in each message of a block, converted to the type `kind`.
+
+        All messages of the block have the same byte layout.
+        """
         cells = np.ascontiguousarray(block[:, self.offset : self.offset + int(self.dtype[2:])])
         return cells.view(self.dtype)[:, 0].astype(kind)
 
@@ -56,7 +59,7 @@ class MessageLeaf:
     Attributes:
         path: path in the message, with the index of every element that is not a number.
         dtype: numpy type of the numbers, with byte order; empty for a text.
-        offset: position of the first byte.
+        offset: offset of the first byte in the message.
         count: number of elements of an array; None for a single number or a text.
         text: content of a text; empty for numbers.
     """
@@ -68,7 +71,7 @@ class MessageLeaf:
     text: str = ""
 
     def numbers(self) -> Iterator[tuple[str, BytePlace]]:
-        """Yield the path and the place of every number."""
+        """Yield the path of every number, with its byte offset and type."""
         if self.count is None:
             yield self.path, BytePlace(self.offset, self.dtype)
         for k in range(self.count or 0):
@@ -83,8 +86,8 @@ class MessageShape:
     Attributes:
         size: number of bytes of a message.
         leaves: all numbers, arrays and texts, in the order of the bytes.
-        fixed: positions of the bytes that are equal in all messages of this shape: those of texts
-            and of lengths of arrays.
+        fixed: offsets of the bytes that are equal in all messages with this byte layout: those of
+            texts and of array lengths.
         values: values of these bytes.
     """
 
@@ -94,11 +97,11 @@ class MessageShape:
     values: UInt8[np.ndarray, " fixed"]
 
     def fits(self, block: UInt8[np.ndarray, "message byte"]) -> Bool[np.ndarray, " message"]:
-        """Return whether each of some messages, all of this shape's size, has this shape."""
+        """Return whether each message of a block has this byte layout; all must have its size."""
         return np.all(block[:, self.fixed] == self.values, axis=1)
 
     def places(self, path: str) -> tuple[BytePlace, ...]:
-        """Return the places of the numbers at a path; empty if there are none."""
+        """Return the byte offset and type of each number at a path; empty if there is none."""
         leaves = (leaf for leaf in self._near(path) if leaf.dtype)
         return tuple(p for leaf in leaves for at, p in leaf.numbers() if _within(at, path))
 
@@ -112,7 +115,7 @@ class MessageShape:
         return sum(1 if leaf.count is None else leaf.count for leaf in self._near(path))
 
     def _near(self, path: str) -> list[MessageLeaf]:
-        """Return the leaves whose paths differ from a path by indices alone."""
+        """Return the leaves whose paths differ from the given path in nothing but indices."""
         return self._by_path.get(without_indices(path), [])
 
     @cached_property
@@ -124,13 +127,13 @@ class MessageShape:
 
 
 def _within(path: str, other: str) -> bool:
-    """Return whether a path has all indices of another path, which has the same fields."""
+    """Return whether a path has every index that another path to the same field gives."""
     steps = zip(path.split("."), other.split("."), strict=True)
     return all(want in (have, have.partition("[")[0]) for have, want in steps)
 
 
 def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
-    """Return the shape of one message.
+    """Return the byte layout of one message.
 
     Args:
         raw: bytes of the message.
@@ -156,9 +159,9 @@ class _MessageWalk:
         raw: bytes of the message.
         cdr: True if the message is serialised as in ROS 2 (CDR).
         order: byte order of numbers, `<` or `>`.
-        at: position of the next byte.
-        origin: position from which alignment counts.
-        fixed: ranges of bytes of texts and lengths found so far.
+        at: offset of the next byte.
+        origin: offset from which alignment counts.
+        fixed: first offset, and offset after the last, of each text and length found so far.
     """
 
     def __init__(self, raw: bytes, cdr: bool) -> None:
@@ -173,7 +176,7 @@ class _MessageWalk:
             self.fixed.append((0, 2))
 
     def leaves(self, kind: FieldType, path: str) -> Iterator[MessageLeaf]:
-        """Yield the leaves of a field, which comes next."""
+        """Yield the leaves of the next field, of type `kind`, and skip its bytes."""
         if kind == TEXT:
             yield MessageLeaf(path, "", self.at, None, self.text())
         elif isinstance(kind, str):
@@ -185,7 +188,7 @@ class _MessageWalk:
             yield from self.elements(kind, path)
 
     def elements(self, kind: ArrayType, path: str) -> Iterator[MessageLeaf]:
-        """Yield the leaves of an array, which comes next."""
+        """Yield the leaves of the next field, an array of type `kind`, and skip its bytes."""
         count, element = self.length() if kind.count is None else kind.count, kind.element
         if isinstance(element, str) and element != TEXT:
             at = self.numbers(int(element[1:]), count)
@@ -197,7 +200,7 @@ class _MessageWalk:
             yield from self.leaves(element, f"{path}[{k}]")
 
     def numbers(self, size: int, count: int) -> int:
-        """Skip some numbers, aligned as CDR demands, and return the position of their first byte.
+        """Skip some numbers, aligned as CDR demands, and return the offset of their first byte.
 
         Args:
             size: bytes of one number.
@@ -212,13 +215,13 @@ class _MessageWalk:
         return first
 
     def length(self) -> int:
-        """Return the length of an array or a text, which comes next, and go past it."""
+        """Return the length of an array or a text, which comes next, and skip its bytes."""
         at = self.numbers(4, 1)
         self.fixed.append((at, at + 4))
         return int(struct.unpack_from(self.order + "I", self.raw, at)[0])
 
     def text(self) -> str:
-        """Return the text that comes next, and go past it."""
+        """Return the text that comes next, and skip its bytes."""
         size = self.length()
         at = self.numbers(1, size)
         self.fixed.append((at, at + size))

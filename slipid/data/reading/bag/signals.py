@@ -74,10 +74,10 @@ def cleaned(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
 def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> None:
     """Append a note if stamps and times of receipt are both used and clearly differ.
 
-    The note is added for differences from `NOTED_DIFFERENCE_S` on.
+    The note is added for differences above `NOTED_DIFFERENCE_S`.
 
     Raises:
-        DataError: they differ by more than `LARGEST_DIFFERENCE_S`.
+        DataError: stamps and times of receipt differ by more than `LARGEST_DIFFERENCE_S`.
     """
     used = [one for one in streams if len(one.number) and not one.topic.name.endswith(STATIC)]
     bare = sorted({one.topic.name for one in used if one.delay is None})
@@ -122,8 +122,8 @@ def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) 
     """Return a signal whose columns come from different messages.
 
     They come from several topics, or from messages that have only some of the columns. The signal
-    has the times of the first column, to which the others are interpolated linearly; times outside
-    the record of some column are left out.
+    has the times of the first column, to which the other columns are interpolated linearly; times
+    outside the record of some column are left out.
 
     Args:
         streams: streams with the columns.
@@ -162,7 +162,7 @@ def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) 
 
 
 def mostly_whole(stream: Stream) -> bool:
-    """Return whether at least half of the rows with any number have all of them."""
+    """Return whether complete rows are at least half as many as the numbers of any one column."""
     whole = int((~stream.absent.any(axis=1)).sum())
     return whole >= 0.5 * int((~stream.absent).sum(axis=0).max(initial=0))
 
@@ -272,8 +272,8 @@ def group_signals(
     else:
         samples = whole_signal(cleaned(checked_stream(streams[0]), layout, notes), notes)
     values = _planar(samples, notes) if plan.channel == "pose" else samples.values
-    # A heading from a quaternion has the name of the quaternion; all columns of a composed pose
-    # have one name.
+    # In messages, a heading from a quaternion has the name of the quaternion, and all columns of a
+    # composed pose have one name.
     named = samples.source.columns
     if len(named) == 1:
         named *= 3
@@ -344,7 +344,7 @@ def _transformed(
 def _unit(
     rotation: Float[np.ndarray, "sample 4"], source: SignalSource
 ) -> Float[np.ndarray, "sample 4"]:
-    """Return quaternions normalised to length 1; raise `DataError` if one is far from it."""
+    """Return quaternions normalised to length 1; raise `DataError` if a length is far from 1."""
     length = np.linalg.norm(rotation, axis=1)
     if (wrong := first_true(np.abs(length - 1.0) > 0.1)) is not None:
         found = f"a quaternion of length {length[wrong]:.3g}"

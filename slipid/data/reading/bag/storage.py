@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 Storage = Literal["rosbag1", "sqlite3", "mcap"]
 EXPECTED = "a bag: a .bag file, a .db3 or .mcap file, or the folder that ros2 bag record wrote"
+OPENABLE = "a bag that can be opened; check its permissions"
 _MAGIC: dict[Storage, bytes] = {
     "rosbag1": b"#ROSBAG V",
     "sqlite3": b"SQLite format 3\0",
@@ -93,7 +94,7 @@ def _storage_of(path: Path) -> Storage:
         with path.open("rb") as file:
             start = file.read(16)
     except OSError as error:
-        raise bad_data(path, f"cannot be read ({error.strerror})", "a readable bag") from error
+        raise bad_data(path, f"cannot be read ({error.strerror})", OPENABLE) from error
     if not start:
         raise bad_data(path, "the file is empty", EXPECTED)
     for storage, magic in _MAGIC.items():
@@ -117,7 +118,7 @@ def _hash(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise bad_data(path, f"cannot be read ({error.strerror})", "a readable bag") from error
+        raise bad_data(path, f"cannot be read ({error.strerror})", OPENABLE) from error
 
 
 _DATA_END, _FOOTER = 0x0F, 0x02
@@ -131,7 +132,7 @@ class RepairedMcap:
 
     Attributes:
         path: path of the file.
-        end: position after the last complete record [byte].
+        end: offset of the byte after the last complete record.
     """
 
     path: Path
@@ -167,7 +168,7 @@ def repaired(path: Path) -> RepairedMcap | None:
 
 
 class _RepairedBytes(io.RawIOBase):
-    """Stream of the bytes of a file up to a position, followed by the end of an MCAP file."""
+    """Stream of the first `end` bytes of a file, followed by the end of an MCAP file."""
 
     def __init__(self, path: Path, end: int) -> None:
         super().__init__()

@@ -18,11 +18,11 @@ from slipid.support.errors import DataError
 BATCH_BYTES = 1 << 20
 """Size of the messages of one topic that are processed together [byte]."""
 MAX_SHAPES = 256
-"""Largest number of remembered shapes of a topic; when it is reached, all are discarded, to save
-memory and time."""
+"""Largest number of remembered byte layouts of a topic; when it is reached, all are discarded, to
+save memory and time."""
 FEW_SHAPES = 16
-"""Number of new shapes in a batch with which all its messages are compared; after these, every
-message is decoded separately."""
+"""Number of new byte layouts in a batch with which all its messages are compared; after these,
+every message is decoded separately."""
 STAMPS = ("header.stamp", "stamp")
 """Paths at which a message may have a time stamp."""
 POSITION = ("translation.x", "translation.y", "translation.z")
@@ -49,12 +49,12 @@ def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
 
 @dataclass(frozen=True)
 class Located:
-    """Places of the picked numbers in messages of one shape.
+    """Byte offsets of the picked numbers in messages with one byte layout.
 
     Attributes:
-        time: places of the seconds and nanoseconds of the message's time stamp; None if it has
-            none.
-        numbers: places of the picked numbers in order, None for a number that is not in these
+        time: offsets of the seconds and nanoseconds of the message's time stamp; None if it has no
+            stamp.
+        numbers: offsets of the picked numbers in order; None for a number that is not in these
             messages.
     """
 
@@ -65,9 +65,10 @@ class Located:
     def of(
         cls, shape: MessageShape, numbers: Sequence[BytePlace | None] = (), part: str = ""
     ) -> "Located":
-        """Return the places of the numbers and of the time stamp of the message or of a part of it.
+        """Return the byte offsets of the numbers and of the time stamp in messages of a layout.
 
-        `part` is the path of the part, followed by a dot.
+        `part` is the path of the part of the message that has the stamp, followed by a dot; it is
+        empty for the whole message.
         """
         for stamp in STAMPS:
             places = [
@@ -91,7 +92,7 @@ class FieldPick:
 
     Attributes:
         paths: paths of the fields.
-        columns: names of the numbers; before the first message with numbers, the paths.
+        columns: names of the numbers; until a message with numbers was seen, the paths.
     """
 
     paths: tuple[str, ...]
@@ -132,7 +133,8 @@ class JointPick:
         """Return the places of the numbers of each row in a message of a shape."""
         names, places = shape.texts("name"), shape.places(self.array)
         self.names.update(dict.fromkeys(names))
-        # The array may be empty; an array of another length does not match the names.
+        # An array with another length than the names, such as an empty one, cannot be assigned to
+        # them and is not used.
         have = dict(zip(names, places, strict=True)) if len(places) == len(names) else {}
         numbers = [have.get(joint) for joint in self.columns]
         return (Located.of(shape, numbers),) if any(numbers) else ()
@@ -164,7 +166,7 @@ Pick = FieldPick | JointPick | TransformPick
 """Rule that picks numbers from the messages of a topic. A message may yield several rows, or none
 if it does not have the numbers."""
 _Places = list[tuple[Located, ...]]
-"""For each pick, the places of each of its rows of numbers in messages of one shape."""
+"""For each pick, the byte offsets of its rows of numbers in messages with one byte layout."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +192,7 @@ class Stream:
     absent: Bool[np.ndarray, "row column"]
 
     def error(self, found: str, expected: str, row: int | None = None) -> DataError:
-        """Return the error about a row, counted from 0, or, if it is None, about the topic."""
+        """Return the error about a row, counted from 0, or about the topic if `row` is None."""
         return self.topic.error(found, expected, None if row is None else int(self.number[row]))
 
     def part(self, which: Int[np.ndarray, " part"] | Bool[np.ndarray, " row"]) -> "Stream":
@@ -206,9 +208,9 @@ def collected(
 
     Args:
         bag: the bag.
-        picks: picks by the name of their topic.
-        stamp: "header" for times from the stamps in the messages, if they have one; "received" for
-            the times of receipt.
+        picks: picks, keyed by the name of their topic.
+        stamp: "header" for times from the stamps in the messages, where messages have stamps;
+            "received" for the times of receipt.
     """
     topics = {name: _Collector(bag.topics[name], few) for name, few in picks.items()}
     for name, received, data in bag.messages(tuple(topics)):
@@ -221,7 +223,7 @@ def collected(
 
 
 class _Rows(NamedTuple):
-    """Rows of numbers from messages of one shape; `stamp` are the messages' own times [ns]."""
+    """Rows of numbers from messages with one byte layout; `stamp` is that of the message [ns]."""
 
     stamp: Int[np.ndarray, " row"] | None
     received: Int[np.ndarray, " row"]
@@ -251,7 +253,11 @@ class _Collector:
             self._take()
 
     def stream(self, pick: int, stamped: bool) -> Stream:
-        """Return all rows of the pick with an index, at the times of their stamps if possible."""
+        """Return all rows of the pick with the index `pick`, in the order of the messages.
+
+        Their times are the stamps if `stamped` is True and every message has one, else the times of
+        receipt.
+        """
         self._take()
         columns, none = self.picks[pick].columns, np.zeros(0, dtype=np.int64)
         empty = np.zeros((0, len(columns)))
@@ -268,12 +274,12 @@ class _Collector:
         delay = None if stamp is None else float(np.median(received - stamp)) / 1e9
         time = stamp if stamped and stamp is not None else received
         stream = Stream(self.topic, columns, time, delay, number, values, absent)
-        # Rows were appended shape by shape, and transform by transform, not in order of messages.
+        # Rows were appended by byte layout, and transform by transform, not in order of messages.
         in_order = (np.diff(number) >= 0).all()
         return stream if in_order else stream.part(np.argsort(number, kind="stable"))
 
     def _take(self) -> None:
-        """Take the numbers from the waiting messages, and discard these messages."""
+        """Extract the picked numbers from the waiting messages, and discard these messages."""
         received = np.array(self._received, dtype=np.int64)
         for which, block, places in self._by_shape():
             number = self._count + 1 + which
@@ -289,7 +295,10 @@ class _Collector:
         self._received, self._data, self._room = [], [], BATCH_BYTES
 
     def _by_shape(self) -> Iterator[tuple[np.ndarray, np.ndarray, _Places]]:
-        """Yield the waiting messages of each shape: their indices, their bytes, and the places."""
+        """Yield the waiting messages grouped by byte layout.
+
+        Each group is given by the messages' indices, their bytes, and the numbers' byte offsets.
+        """
         lengths = np.fromiter(map(len, self._data), np.int64, len(self._data))
         for length in np.unique(lengths).tolist():
             rest = np.flatnonzero(lengths == length)
@@ -307,7 +316,7 @@ class _Collector:
                 rest, block = rest[~same], block[~same]
 
     def _known(self, k: int) -> tuple[MessageShape, _Places]:
-        """Return the shape of waiting message k and its places, and remember them."""
+        """Return and remember the byte layout of waiting message k, and its numbers' offsets."""
         shape = self.topic.shape(self._data[k], self._count + 1 + k)
         if sum(map(len, self._shapes.values())) >= MAX_SHAPES:
             self._shapes.clear()

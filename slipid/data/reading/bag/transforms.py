@@ -74,8 +74,8 @@ class TransformSeries:
 def composed(links: Sequence[ChainLink], moving: Mapping[Edge, TransformSeries]) -> TransformSeries:
     """Return the pose of a chain's last frame in its first frame.
 
-    It has the times of the transform with the most samples, as far as all other transforms were
-    recorded then.
+    The pose is given at the times of the transform with the most samples, as far as all other
+    transforms were recorded at these times.
     """
     densest = max((moving[link.edge] for link in links), key=lambda one: len(one.time))
     time = densest.time

@@ -357,7 +357,9 @@ def test_a_definition_that_is_nowhere(tmp_path):
     with pytest.raises(DataError, match=r"Inner, which my_msgs/msg/Amps contains.* no Inner.msg"):
         runs_of(path, declared_bag_layout(given, "layout"))
     (tmp_path / "Inner.msg").write_text("float64 x\n")
-    with pytest.raises(DataError, match=r"topic '/amps' message 1: it is no my_msgs/msg/Amps"):
+    with pytest.raises(
+        DataError, match=r"topic '/amps' message 1: the message is no my_msgs/msg/Amps"
+    ):
         runs_of(path, declared_bag_layout(given, "layout"))
     (tmp_path / "Inner.msg").write_text("float32 ; x\n")
     with pytest.raises(DataError, match=r"the definition of my_msgs/msg/Amps cannot be read"):
