@@ -6,8 +6,8 @@ the runs on one floor, and how much runs scatter before any physics is fitted to
 For the scatter, the motion of the body is regressed on smooth functions of the wheels' motion, by
 floor and load set-up: a Fourier series in the direction of travel, the yaw, the change of the
 wheels' motion per lag of the camera and, where the position of the marker on the body is fitted,
-the displacement of the marker by turning. Every run is predicted from the others. The residual in
-window k of run r, over the distance d_rk, is
+the displacement of the marker by turning. Every run is predicted from all other runs with its floor
+and load set-up. The residual in window k of run r, over the distance d_rk, is
 
     e_rk = a_r d_rk + s_rk,   var a = v_run,   var s_rk = v_process d_rk
 
@@ -18,8 +18,8 @@ expectations:
     sum_rk (e_rk - a^_r d_rk)^2 = v_process sum_r (D_r - sum_k d_rk^2 / D_r)
     sum_r (sum_k e_rk)^2        = v_run sum_r D_r^2 + v_process sum_r D_r
 
-Squares are summed before they are divided by distances, because in windows in which a robot hardly
-moves, the noise of the poses divided by the small distance would dominate.
+Squares are summed before they are divided by distances: otherwise windows with little motion would
+dominate, in which the noise of the poses is divided by a small distance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,27 +43,28 @@ from slipid.predict.slip_model import body_twist, setups, turned
 from slipid.search_space import Space
 
 WORSE_RATIO = 1.5
-"""Largest accepted ratio of a floor's end-point errors after a fit to more runs to those before.
+"""Largest accepted factor by which a floor's mean end-point error grows when runs over several
+floors are added to the fit.
 
-With a wrong map the ratio is several.
+A wrong map makes the error several times larger.
 """
 LARGEST_SHIFT = 4.0
-"""Largest accepted shift of a number, in its standard errors, when runs over several floors are
-added to those on single floors."""
+"""Largest accepted shift of a parameter, in its standard errors, when runs over several floors are
+added to the runs on one floor each."""
 ONE_FLOOR_RATIO = 0.8
 """Ratio of the error as if all wheels were on one floor to the error with the map, below which the
 map is rejected."""
 SURE_GROWTH = 3.0
-"""Standard errors of paired differences above which a growth of errors is not due to chance."""
+"""A mean growth of errors above this is not due to chance [standard error of the mean growth]."""
 
 
 @dataclass(frozen=True)
 class FloorErrors:
-    """End-point errors of the runs on one floor, divided by the distance driven.
+    """End-point errors of the runs on one floor, divided by their straight-line displacements.
 
     Attributes:
         before: error of the fit without runs over several floors.
-        after: error of the fit that includes them.
+        after: error of the fit that includes the runs over several floors.
         is_worse: True if the error grew by more than `WORSE_RATIO` and by more than chance.
     """
 
@@ -75,9 +76,9 @@ class FloorErrors:
 def floor_errors(
     before: PredictiveModel, after: PredictiveModel, data: Runs
 ) -> dict[str, FloorErrors]:
-    """Return the errors of runs on one floor each under two models, by floor.
+    """Return the errors of runs on one floor each under two models, keyed by floor.
 
-    Both models were fitted to these runs, the second one also to others.
+    Both models were fitted to these runs, the second one also to runs over several floors.
     """
     (old, distance), (new, _) = end_errors(before, data), end_errors(after, data)
     return compared([log.surface or "unknown" for log in data.logs], old, new, distance)
@@ -89,14 +90,15 @@ def compared(
     new: Float[np.ndarray, " run"],
     distance: Float[np.ndarray, " run"],
 ) -> dict[str, FloorErrors]:
-    """Return old and new errors by floor, from errors [m] and distances driven [m] of each run."""
+    """Return old and new errors, keyed by floor, from errors and displacements of each run [m]."""
     out = {}
     for name in dict.fromkeys(floors):
         mine = np.array([floor == name for floor in floors])
         grown = new[mine] - old[mine]
         _, error, _ = mean_error(grown, np.arange(len(grown)))
         much = new[mine].mean() > WORSE_RATIO * old[mine].mean()
-        total = max(float(distance[mine].sum()), 1e-9)  # runs may turn on the spot
+        # The displacement is zero if all runs turn on the spot.
+        total = max(float(distance[mine].sum()), 1e-9)
         out[name] = FloorErrors(
             float(old[mine].sum() / total),
             float(new[mine].sum() / total),
@@ -120,11 +122,11 @@ def end_errors(
 def largest_shift(
     space: Space, before: Search, covariance: Square, after: Search, settled: bool
 ) -> tuple[str, float]:
-    """Return the number, estimated from motion, that shifted most, and its shift [std before].
+    """Return the motion parameter that shifted most, and its shift [std before].
 
-    Numbers of the camera are excluded. The shift is infinite if the fit with the added runs did not
-    settle. Added runs that agree with the model change a number by less than the standard error it
-    had without them (Hausman 1978, Econometrica 46(6)).
+    Parameters of the camera are excluded. The shift is infinite if the fit with the added runs did
+    not settle. If the added runs agree with the model, they change a parameter by less than the
+    standard error it had before (Hausman 1978, Econometrica 46(6)).
     """
     known = ~space.electric & ~space.where(lambda e: e.part == "camera")
     sigma = np.where(known, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
@@ -138,16 +140,17 @@ def contradiction(
     by_map: float,
     as_if: Mapping[str, float],
 ) -> str | None:
-    """Return the reason to reject runs over several floors, None if they agree with the others.
+    """Return the reason to reject runs over several floors, None if they agree with all other runs.
 
     Args:
-        found: errors of the runs on one floor each, by floor.
-        shift: fitted number that changed most, and its change in standard errors.
-        by_map: error of the runs over several floors [m/s], the wheels' floors taken from the map.
-        as_if: error as if all wheels had always stood on one floor, by floor [m/s].
+        found: errors of the runs on one floor each, keyed by floor.
+        shift: fitted parameter that changed most, and its change in standard errors.
+        by_map: error of the runs over several floors [m/s], with the wheels' floors from the map.
+        as_if: error of the same runs as if all wheels always stood on one floor, keyed by that
+            floor [m/s].
     """
     worse = ", ".join(
-        f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the distance driven"
+        f"{floor} grow from {100 * e.before:.1f} to {100 * e.after:.1f} % of the displacement"
         for floor, e in found.items()
         if e.is_worse
     )
@@ -156,12 +159,12 @@ def contradiction(
     if worse:
         reason = f"end-point errors on {worse}"
     elif not np.isfinite(sigma):
-        reason = "the fit to all of them did not converge"
+        reason = "the fit to all runs did not converge"
     elif sigma > LARGEST_SHIFT:
         reason = f"{name} changes by {sigma:.0f} standard errors"
     elif as_if[best] < ONE_FLOOR_RATIO * by_map:
-        errors = f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} mm/s"
-        reason = f"errors of {errors} as if all on {best}"
+        errors = f"{1000 * by_map:.1f} mm/s with their map, but {1000 * as_if[best]:.1f} mm/s"
+        reason = f"errors are {errors} as if all wheels were on {best}"
     else:
         return None
     return (
@@ -176,10 +179,11 @@ _RIDGE = 1e-6
 
 
 def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
-    """Return the log variance of every noise component: of the scatter, or typical if larger.
+    """Return the log variance of every noise component, from the scatter or its typical value.
 
-    These variances take as noise everything that smooth functions of the wheels' motion do not
-    explain. The scatter is large on a floor with too few runs to predict each from the others.
+    The larger of the two is used. All motion that smooth functions of the wheels' motion do not
+    explain counts as noise. On a floor with few runs the scatter is large, as its runs do not
+    predict each other well.
     """
     w, robot = problem.windows, problem.robot
     distance, _ = travel(w, robot)

@@ -31,17 +31,17 @@ BOUND_PRECISION = 1e12
 RIDGE = 1e-6
 """Ridge on each coefficient of a monotone curve, relative to the norm of its column.
 
-It has no visible influence on coefficients that the runs determine. Of other coefficients it
-selects the smallest values; without it, rounding errors would select them."""
+The ridge has no visible influence on coefficients that the runs determine. It makes all other
+coefficients as small as possible, which rounding errors would determine without it."""
 
 
 def current(signals: RunSignals, spec: RobotSpec) -> Slips:
-    """Return the current of every wheel along its motion [A]; zeros if none was logged."""
+    """Return currents [A], positive if the motor drives its wheel; zeros if none were logged."""
     return np.zeros_like(signals.turn) if signals.current is None else signals.along(spec)
 
 
 def soft_torque(signals: RunSignals, spec: RobotSpec) -> Slips:
-    """Return the torque of every motor [N m] by its model; zeros without logged currents.
+    """Return the torque (`RunSignals.torque`) of every motor [N m]; zeros without logged currents.
 
     Currents fade to zero near standstill, I = |I| w / sqrt(w^2 + w0^2), because an unsigned ammeter
     does not show the sign of a current there.
@@ -108,7 +108,7 @@ class CurveModel(WheelSlip):
         return np.clip(self.regressors(steps, spec) @ self.known, -self.most, self.most)
 
     def regressors(self, steps: Steps, spec: RobotSpec) -> Float[np.ndarray, "step drive k"]:
-        """Return the features whose sum, weighted by the coefficients, is each drive's slip."""
+        """Return the features; their sum, weighted by the coefficients, is each drive's slip."""
         x = self.regressor(steps.signals, spec)
         phi = self.features(x if self.smoothing is None else steps.smoothed(x, self.smoothing))
         if not self.per_wheel:
@@ -163,7 +163,8 @@ class Saturating(WheelSlip):
 
         torque = soft_torque(w.steps.signals, spec)
         top = float(np.log(max(torque.max(), 1e-3) * 1.5))
-        # the cap of 0.98 causes several minima; with one-sided differences, rounding selects one
+        # The cap of 0.98 causes several minima: hence several starts, and 3-point differences, as
+        # rounding errors of one-sided ones would select the minimum.
         starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
         tries = [least_squares(errors, x, jac="3-point", max_nfev=200) for x in starts]
         return replace(self, coefficients=min(tries, key=lambda r: r.cost).x)

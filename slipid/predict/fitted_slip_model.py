@@ -33,19 +33,19 @@ MOST_ROUNDS, SCORING_STEPS, SETTLED_CHANGE = 15, 4, 0.02
 """Limits of the fit of variances: largest number of rounds, scoring steps per round, and the change
 of every log variance below which rounds stop.
 
-The covariance of the model's numbers is computed once per round.
+The covariance of the model's coefficients is computed once per round.
 """
 VAGUE_PRECISION = 1e-2
-"""Prior precision of a model's numbers: a std of 10 is uninformative for slips below one."""
+"""Prior precision of a model's coefficients: a std of 10 is uninformative for slips below one."""
 STEP = 1e-4
-"""Step of the difference quotients with which a model is differentiated by its numbers."""
+"""Step of a coefficient in the difference quotients that differentiate a model."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedSlipModel(PredictiveModel):
     """A fitted slip model with its noise variances and the camera of the force balance.
 
-    The model's numbers depend on the camera's, so that errors of the camera propagate to them.
+    The model is fitted with the camera's parameters, whose errors propagate to its coefficients.
 
     Attributes:
         model: the slip model, fitted floor by floor.
@@ -96,7 +96,7 @@ def fit_with_noise(
     """Return a slip model fitted to the kept segments of a problem, with noise from its residuals.
 
     Variances are estimated by Fisher scoring of the restricted likelihood, as for the force
-    balance, which accounts for the degrees of freedom of the model's own numbers.
+    balance. This likelihood accounts for the degrees of freedom of the model's coefficients.
     """
     robot = contact.robot
     w = problem.windows.at_lag(float(robot.camera.lag)).segments(np.flatnonzero(keep > 0))
@@ -133,7 +133,7 @@ def fit_with_noise(
 
 
 def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:
-    """Return the prior precision of a model's numbers, with ridges and active bounds."""
+    """Return the prior precision of a model's coefficients, with ridges and active bounds."""
     held = model.stiffness(w, robot)
     parts = [
         VAGUE_PRECISION * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()
@@ -144,13 +144,17 @@ def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray
 def _number_covariance(
     before: np.ndarray, common: np.ndarray, scale: np.ndarray, slope: Slopes, keep: np.ndarray
 ) -> np.ndarray:
-    """Return the covariance of a model's numbers and the camera's, on which they depend.
+    """Return the joint covariance of a model's coefficients and of the camera's parameters.
+
+    The fitted coefficients shift with the camera's parameters, whose errors are thus part of the
+    covariance of the coefficients.
 
     Args:
-        before: prior precision of the model's numbers.
-        common: covariance of the camera's numbers.
+        before: prior precision of the model's coefficients.
+        common: covariance of the camera's parameters.
         scale: noise covariance of every segment.
-        slope: derivative of the residuals by the model's numbers, then by the camera's.
+        slope: derivative of the residuals with respect to the coefficients, then with respect to
+            the camera's parameters.
         keep: 1 for fitted segments, else 0.
     """
     own, m = len(before), slope.shape[1]
@@ -179,10 +183,10 @@ _residual_jacobian = eqx.filter_jit(jax.jacfwd(_residual, argnums=1))
 
 
 def slopes(model: FloorModels, w: Windows, of: Callable[[FloorModels], np.ndarray]) -> np.ndarray:
-    """Return the derivative of function `of` of a model by its numbers (segment, ..., number).
+    """Return the derivative of `of(model)` with respect to the coefficients (segment, ..., number).
 
-    Numbers are in the order of the keys of `state`. Each segment depends on the numbers of one key
-    only, so that one number of every key is varied at the same time.
+    Coefficients are in the order of the keys of `state`. Each segment depends on the coefficients
+    of one key only, so that one coefficient of every key is varied at the same time.
     """
     ends = np.cumsum([0, *(v.size for v in model.state.values())]).tolist()
     now = of(model)

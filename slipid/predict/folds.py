@@ -50,7 +50,7 @@ def fold_keys(data: Runs) -> list[FoldKey]:
 
 
 def _by_heading(keys: Sequence[FoldKey], of: Callable[[Float[np.ndarray, " run"]], Fold]) -> Fold:
-    """Return the fold of every run by a function of its commanded heading [deg], -1 if unknown."""
+    """Return the fold `of(heading)` of every commanded heading [deg], -1 for unknown headings."""
     heading = np.array([f.heading_deg for f in keys], float)
     known = np.isfinite(heading)
     return np.where(known, of(np.where(known, heading, 0.0)), -1)
@@ -73,9 +73,9 @@ def random_headings(keys: Sequence[FoldKey]) -> Fold:
 def speeds(keys: Sequence[FoldKey], most: int | None = None) -> Fold:
     """Return the fold of every run by its commanded speed, -1 for runs that are never held out.
 
-    Never held out are turns on the spot, runs without a commanded speed, and runs whose floor and
-    load set-up has all its runs in one fold. Every speed is a fold; if there are more than twice
-    `most` speeds, the folds are `most` groups of equally many speeds.
+    Every speed is a fold; if there are more than twice `most` speeds, the folds are `most` groups
+    of equally many speeds. Never held out are turns on the spot, runs without a commanded speed,
+    and runs with a floor and load set-up all of whose runs are in one fold.
     """
     speed = np.round([f.speed for f in keys], 3)
     where, known = np.array([f.floor for f in keys]), np.isfinite(speed) & (speed > 0)
@@ -95,7 +95,7 @@ QUESTIONS: dict[str, Callable[[Sequence[FoldKey]], Fold]] = {
     "speeds": speeds,
     "random": random_headings,
 }
-"""Functions that assign runs to folds, by the name of the question that the comparison answers.
+"""Functions that assign runs to folds, keyed by the question that the comparison answers.
 
 Held out together are the runs of a 60 degree sector of headings, of one speed, or of random
 headings.
@@ -103,11 +103,11 @@ headings.
 
 
 def inner_folds(data: Runs, question: str, judged: np.ndarray) -> Fold:
-    """Return the folds of a model's inner cross-validation, with which it selects its settings.
+    """Return the folds of the inner cross-validation with which a model selects its settings.
 
-    They hold out runs as the question does. A sector next to a judged one is not held out (fold -1)
-    if at least two others are left, since the gap of the two together would be wider than that
-    of the question.
+    The inner folds hold out runs as the question does. A sector next to a judged sector gets fold
+    -1 (never held out) if at least two other sectors remain: both sectors together would leave a
+    gap twice as wide as that of the question.
 
     Args:
         data: all runs.
@@ -127,20 +127,20 @@ def inner_folds(data: Runs, question: str, judged: np.ndarray) -> Fold:
 def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
     """Return the fold of every run; -1 for runs that are always fitted and never judged.
 
-    Such runs lack the property by which runs are held out, or holding out their fold would leave no
-    run of their floor and load set-up. With `parts`, folds whose numbers have the same remainder
-    modulo `parts` are merged.
+    Runs with fold -1 lack the property by which runs are held out, or holding out their fold would
+    leave no run of their floor and load set-up. With `parts`, folds whose numbers have the same
+    remainder modulo `parts` are merged.
 
     Raises:
-        DataError: no such question.
-        ValueError: fewer than two parts.
+        DataError: the question is unknown.
+        ValueError: there are fewer than two parts.
     """
     if question not in QUESTIONS:
         raise DataError(
-            f"folds '{question}': no such question; expected some of {', '.join(QUESTIONS)}"
+            f"folds '{question}': no such question; expected one of {', '.join(QUESTIONS)}"
         )
     if parts is not None and parts < 2:
-        raise ValueError(f"{parts} parts; expected 2 or more")
+        raise ValueError(f"folds in {parts} parts; expected 2 or more")
     keys = fold_keys(data)
     fold = QUESTIONS[question](keys)
     if parts is not None:
@@ -158,10 +158,10 @@ class FoldResult:
 
     Attributes:
         rows: scores of every run.
-        seconds: time to `fit` and to `predict` [s], by model.
-        numbers: count of fitted numbers, by model and floor.
+        seconds: time to `fit` and to `predict` [s], keyed by model.
+        numbers: number of fitted parameters, keyed by model and floor.
         converged: True if the fit of the force balance converged.
-        reason: reason why that fit stopped.
+        reason: reason why the fit of the force balance stopped.
     """
 
     rows: tuple[ScoredRun, ...]
@@ -182,7 +182,7 @@ class FoldModels:
         problem: problem of the fit.
         optimum: result of the fit of the force balance.
         models: the fitted models, the force balance first.
-        seconds: time to fit [s], by model.
+        seconds: time to fit [s], keyed by model.
     """
 
     problem: Problem
@@ -222,9 +222,9 @@ def fit_fold(
 def problem_of_runs(
     problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
 ) -> Problem:
-    """Return the problem of a fit to some of its runs; numbers they cannot determine are fixed.
+    """Return the problem with those parameters fixed that the runs `fitted` cannot determine.
 
-    `fitted` are the indices of these runs.
+    `fitted` holds indices of runs of `data`.
     """
     fixed = fixed_viscosities(data, fitted)
     return problem.holding(fixed, choices) if fixed else problem
@@ -238,11 +238,11 @@ def judge(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> FoldResult:
-    """Return the scores of one fold: every slip model fitted without its runs, and judged on them.
+    """Fit every slip model without the runs of one fold, and return its scores on these runs.
 
     Args:
         problem: problem of all the runs of `data`, made with the choices.
-        choices: the user's choices for numbers.
+        choices: the user's choices for parameters.
         data: all runs.
         question: key of `QUESTIONS` by which runs are held out, and by which models select their
             settings on the other runs.

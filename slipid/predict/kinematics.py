@@ -14,8 +14,8 @@ models but `encoder` are for wheels that do not determine motion sideways (skid 
 differential drives): on other robots v_y is not -x yaw. None of them has settings.
 
 Liberties:
-    - The five numbers of the instantaneous centres are those of Mandow et al. in another form;
-        theirs are the positions y_left, y_right, x of three centres and two gains, alpha_left,
+    - The five coefficients of the instantaneous centres are equivalent to those of Mandow et al.,
+        which are the positions y_left, y_right, x of three centres and two gains, alpha_left,
         alpha_right.
     - Displacements over windows are fitted by least squares, instead of whole paths by an
         optimiser; the effective track of a ROS controller is usually adjusted by hand and has no
@@ -43,10 +43,10 @@ the sum of far^2, and the constant is not penalised. The weight is chosen in one
       each floor and load set-up.
 
 Liberties:
-    - It is not a published system. A table of corrections over the direction of travel is what a
-        practitioner would make for an omni robot, and any slip model should predict better.
+    - The table is not a published system. A table of corrections over the direction of travel is
+        what a practitioner would make for an omni robot, and any slip model should predict better.
     - Harmonics above the sixth are omitted.
-    - It does not depend on speed: runs of all speeds are pooled.
+    - The table does not depend on speed: runs of all speeds are pooled.
 
 Source: slipid's own.
 """
@@ -71,11 +71,11 @@ LONGEST_LAG = 2.0
 @final
 @dataclass(frozen=True)
 class Encoder(TwistModel):
-    """No slip: xi = J^+ r w. Nothing is fitted; every other model is compared with it.
+    """No slip: xi = J^+ r w. Nothing is fitted; every other model is compared with this one.
 
     Attributes:
         shape: geometry to use instead of the robot's, None for the robot's own.
-        lag: lag of the poses behind the wheels [s], None for that of the steps.
+        lag: lag of the poses behind the wheels [s], None for the lag of the steps.
     """
 
     learns: ClassVar[bool] = False
@@ -101,8 +101,8 @@ def nominal(shape: Geometry) -> Encoder:
 class Corrected(TwistModel):
     """Kinematics corrected by least squares; see the module docstring.
 
-    The coefficients are a, b, x, then c, e, then f, as far as the model with this `name` has them;
-    a fitted lag [s] comes last.
+    The coefficients are a, b, x, c, e, f, of which the model `name` has the first 3, 5 or 6
+    (`TERMS`); a fitted lag [s] comes last.
 
     Attributes:
         shape: geometry whose encoder twists are corrected, None for the robot's own.
@@ -144,11 +144,11 @@ def corrected(rolling: Twists, numbers: Float[np.ndarray, " number"]) -> Twists:
 HARMONICS = 6
 """Number of harmonics of the Fourier series over directions of travel."""
 RIDGES = (1e-5, 1e-3, 1e-1, 10.0)
-"""Weights of the ridge among which the benchmark selects."""
+"""Weights of the ridge from which the benchmark selects."""
 WEIGHTS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Weights of the ridge from which `HeadingLookup` selects by its own cross-validation."""
 Together = Int[np.ndarray, " run"]
-"""Group number of every run: runs with equal numbers are held out together, -1 never."""
+"""Group number of every run: runs with equal numbers are held out together, runs with -1 never."""
 
 
 @final
@@ -159,8 +159,8 @@ class HeadingLookup(TwistModel):
     The coefficients are c for (along, across, yaw).
 
     Attributes:
-        ridge: weight of the ridge, None to select it by cross-validation.
-        together: group number of every run in that cross-validation, None for random groups.
+        ridge: weight of the ridge, None to select it by an inner cross-validation.
+        together: group number of every run in the inner cross-validation, None for random groups.
     """
 
     by_load: ClassVar[bool] = True
@@ -197,7 +197,10 @@ class HeadingLookup(TwistModel):
         return _HeadingTable(fourier(rolling * w.dt[:, None]), gap, self._fold(w.run))
 
     def _fold(self, run: Int[np.ndarray, " window"]) -> Int[np.ndarray, " window"]:
-        """Return the fold of every window; without two groups of `together`, five random ones."""
+        """Return the fold of every window: its group in `together`, if there are several groups.
+
+        Otherwise the runs are divided into five random folds.
+        """
         fold = np.full(len(run), -1) if self.together is None else self.together[run]
         if len(set(fold[fold >= 0].tolist())) > 1:
             return fold
@@ -222,7 +225,8 @@ class _HeadingTable(NamedTuple):
         return np.asarray(weight * np.sum(self.phi[:, 0] ** 2) * np.diag(rough))
 
     def solved(self, weight: float) -> np.ndarray:
-        # If the robot never moved, all features are zero, and lstsq returns zero corrections.
+        # `lstsq` also solves a singular system: if the robot never moved, all features are zero,
+        # and so are the corrections.
         gram = self.phi.T @ self.phi + self.penalty(weight)
         return np.asarray(np.linalg.lstsq(gram, self.phi.T @ self.gap, rcond=None)[0])
 

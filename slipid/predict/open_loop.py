@@ -68,7 +68,8 @@ def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
 def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
     """Return the runs, each as one segment of a given number of steps, `RUNS_PER_CALL` at a time.
 
-    The last runs of a group are repeated to fill it up, so that few shapes are compiled.
+    The last run of an incomplete group is repeated to fill the group, so that few shapes are
+    compiled.
     """
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
     out = []
@@ -112,11 +113,12 @@ def end_jacobian(
     twist: Numbers | None = None,
     effects: tuple[Numbers, Numbers] | None = None,
 ) -> Float[Array, "segment 2 free"]:
-    """Return the derivative of the end points by the search vector, from given start poses.
+    """Return the derivative of end points with respect to the search vector, at fixed start poses.
 
-    The path is that of given body twists (segment, window, 3), or else that of the contact
-    equilibrium less the increments by expected shared `effects` (segment, window, 3) [m, m, rad],
-    which are given with their derivative by the search vector.
+    The path follows body twists (segment, window, 3) if `twist` is given, else the contact
+    equilibrium. `effects`, if given, holds the increments by expected shared effects (segment,
+    window, 3) [m, m, rad], which are subtracted, and their derivative with respect to the search
+    vector.
     """
 
     def end(x: Array) -> Array:
@@ -143,19 +145,20 @@ def end_covariance(
 ) -> Float[np.ndarray, "segment 2 2"]:
     """Return the scale matrices of the Student t of predicted less measured end points [m^2].
 
-    They include process noise, the run's own effect, shared effects, camera noise of both end
-    points and of the start heading, and the uncertainty of the parameters; each is propagated to
-    the end point along the predicted path.
+    The matrices include process noise, the individual run effect, shared effects, camera noise of
+    the first and last position and of the start heading, and the uncertainty of the parameters;
+    each is propagated to the end point along the predicted path.
 
     Args:
-        variance: variances of the noise components by name.
+        variance: variances of the noise components, keyed by name.
         shared: covariance of the shared effects along, across and in yaw.
         of_parameters: covariance of the end points due to uncertain parameters.
     """
     far, u = travel(w, robot)
     p = tracks.predicted
     cov = of_parameters.copy()
-    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])  # shift of the end point per yaw in each step
+    # The end point shifts by this lever per yaw in each step.
+    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])
     way = p[:, :-1, 2]
     along, across = turned(way, u), turned(way, turned_left(u))
     process, run = (by_axis(variance, k, w) for k in ("process", "run"))

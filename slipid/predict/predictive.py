@@ -6,13 +6,14 @@ the scale matrix
     V + E diag(v) E^T + J C J^T
 
 V is the noise covariance, with camera, process and run variances estimated from the model's own
-residuals by restricted likelihood. v are the variances of shared effects and E the derivative of
-increments by effects. J is the derivative by the model's and the camera's numbers, and C their
-covariance. Simpler models have session effects only (`slipid.fitting.session_effects`). The force
-balance has the session and neighbours' effects of its fit (`slipid.fitting.shared_effects`), and
-its variances are multiplied by a factor from held-out sectors (`hierarchy.extrapolation`). All
-models use the camera fitted with the force balance, and errors of the camera propagate to the
-numbers of the simpler models.
+residuals by restricted likelihood. v are the variances of shared effects, and E is the derivative
+of the increments with respect to these effects. J is the derivative of the increments with respect
+to the parameters of the model and of the camera, and C is the covariance of these parameters.
+Simpler models have session effects only (`slipid.fitting.session_effects`). The force balance has
+the session and neighbours' effects of its fit (`slipid.fitting.shared_effects`); the variances of
+shared effects and of parameters are multiplied by a factor from held-out sectors
+(`hierarchy.extrapolation`). All models use the camera fitted with the force balance, and errors of
+the camera propagate to the coefficients of the simpler models.
 """
 
 import abc
@@ -59,13 +60,12 @@ Slopes = Float[np.ndarray, "segment m number"]
 
 @dataclass(frozen=True, eq=False)
 class PredictiveModel(abc.ABC):
-    """A fitted model with noise variances, which predicts distributions.
+    """A fitted model with its noise variances, so that it predicts distributions.
 
     Attributes:
         robot: the fitted robot, for its camera and geometry.
-        variance: variance of every noise component by name, and of session effects where there are
-            any.
-        covariance: covariance of the model's numbers, followed by the camera's.
+        variance: variances, keyed by name, of every noise component and of any session effects.
+        covariance: covariance of the model's parameters, followed by those of the camera.
     """
 
     robot: Robot
@@ -80,7 +80,7 @@ class PredictiveModel(abc.ABC):
     @property
     @abc.abstractmethod
     def numbers(self) -> dict[str, int]:
-        """Count of fitted numbers by floor, and of those `shared` by all floors; without camera."""
+        """Number of fitted parameters without the camera, keyed by floor, or `shared` by floors."""
 
     def log_variance(self, problem: Problem) -> Float[np.ndarray, " variance"]:
         """Return the log variance of every noise component of a problem."""
@@ -88,7 +88,10 @@ class PredictiveModel(abc.ABC):
 
     @abc.abstractmethod
     def linear(self, problem: Problem) -> tuple[Residuals, Slopes]:
-        """Return predicted less measured increments of every segment, and their derivative."""
+        """Return predicted less measured increments, and their derivative (segment, m, number).
+
+        The derivative is with respect to the parameters of `covariance`.
+        """
 
     @abc.abstractmethod
     def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
@@ -110,19 +113,19 @@ class PredictiveModel(abc.ABC):
         return residual, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
 
     def _number_covariance(self, w: Windows, slope: Slopes) -> Float[np.ndarray, "segment m m"]:
-        """Return the covariance due to uncertain numbers, times `growth`."""
+        """Return the covariance due to uncertain parameters, times `growth`."""
         return self.growth(w)[:, None, None] * parameter_covariance(slope, self.covariance)
 
     def growth(self, w: Windows) -> Float[np.ndarray, " segment"]:
-        """Return the factor of the variances of numbers and shared effects for runs not fitted."""
+        """Return the factor of parameter and shared-effect variances for runs not fitted."""
         return np.ones(len(w))
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "segment 3 3"]:
-        """Return the covariance of the shared effects of runs in sessions that were not fitted."""
+        """Return the covariance of the shared effects of runs whose session was not fitted."""
         return by_axis(self.variance, "session", w)[:, :, None] * np.eye(len(AXES))
 
     def log_density(self, problem: Problem) -> Float[np.ndarray, " segment"]:
-        """Return the predictive log density of every segment's logged poses, given the first one.
+        """Return the predictive log density of each segment's logged poses, given its first pose.
 
         The density is per logged unit of position and heading.
         """
@@ -152,11 +155,11 @@ class ForceBalance(PredictiveModel):
     """The fitted force balance, at the search vector z.
 
     Attributes:
-        space: free numbers and their prior.
+        space: free parameters and their prior.
         z: search vector of the fit.
-        shared: fitted effects that neighbouring runs share, by floor.
-        extrapolation: factor, by `floor@load`, that multiplies the variances of numbers and shared
-            effects for runs that were not fitted.
+        shared: fitted effects that neighbouring runs share, keyed by floor.
+        extrapolation: factors, keyed by `floor@load`, that multiply the variances of parameters and
+            shared effects for runs that were not fitted.
     """
 
     space: Space
@@ -170,10 +173,10 @@ class ForceBalance(PredictiveModel):
 
     @property
     def forecast(self) -> dict[str, float]:
-        """Variances by name for runs that were not fitted.
+        """Variances, keyed by name, for runs that were not fitted.
 
-        Those of shared effects are multiplied by the largest extrapolation factor of the floor's
-        load set-ups.
+        The variances of shared effects are multiplied by the largest extrapolation factor of the
+        floor's load set-ups.
         """
         out = dict(self.variance)
         for name in out:
@@ -217,16 +220,17 @@ class ForceBalance(PredictiveModel):
         return np.asarray(blocks["motion"]) - residual, np.asarray(jac["motion"]) - slope
 
     def _correction(self, w: Windows) -> tuple[Residuals, Slopes]:
-        """Return the change of increments by expected effects, and its derivative by z.
+        """Return the change of increments by expected effects, and its derivative.
 
-        Both are to be subtracted from the predictions of the contact law.
+        The derivative is with respect to the search vector. Both are to be subtracted from the
+        predictions of the contact law.
         """
         expected, e = self.expected_effects(w), effects(w, self.robot)
         mean = np.einsum("nma,na->nm", e, expected.mean)
         return mean, np.einsum("nma,nap->nmp", e, expected.slope)
 
     def tracks(self, w: Windows) -> replay.Tracks:
-        """Return the tracks of whole runs by the force balance and the expected effects."""
+        """Return tracks of whole runs, predicted by the force balance and expected effects."""
         increments = np.asarray(replay.contact_increments(self.robot, lk.batch(w, self.robot)))
         mean = self._correction(w)[0].reshape(increments.shape)
         return replay.tracks_from_increments(self.robot, w, increments - mean)
@@ -268,7 +272,7 @@ def _fitted_effects(
     residual: Blocks,
     jacobian: Blocks,
 ) -> dict[str, FittedEffects]:
-    """Return the fitted effects that neighbouring runs share, by floor; `keep` marks the runs."""
+    """Return fitted effects of neighbouring runs, keyed by floor; `keep` marks fitted segments."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     weighed = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
     white = jnp.einsum("nij,nj->ni", weighed.whitening.root["motion"], residual["motion"])
@@ -294,7 +298,11 @@ def _fitted_effects(
 
 
 def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
-    """Return J C J^T of every segment, computed without the columns of J that are zero for it."""
+    """Return the covariance J C J^T of every segment's predictions due to uncertain parameters.
+
+    `jac` is the derivative J of the predictions with respect to the parameters, and `cov` is the
+    covariance C of the parameters. Columns of J that are zero in a segment are skipped there.
+    """
     used = (jac != 0.0).any(axis=1)
     patterns, which = np.unique(used, axis=0, return_inverse=True)
     out = np.zeros((len(jac), jac.shape[1], jac.shape[1]))
@@ -306,5 +314,5 @@ def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
 
 
 def by_name(problem: Problem, log_v: Vector) -> dict[str, float]:
-    """Return variances by the names of their components."""
+    """Return variances, keyed by the names of their noise components."""
     return dict(zip(problem.noise.names, np.exp(np.asarray(log_v)).tolist(), strict=True))

@@ -1,9 +1,9 @@
 """Ranking of slip models by held-out runs, and transfer of slip curves between floors.
 
 The transfer tests whether a curve of slip over current is valid on a floor it was not fitted to:
-one curve s = b0 + b1 |I| for all wheels is fitted to all floors but one and judged on that one. It
-is compared with a constant slip fitted to the same floors and with a curve fitted to the floor
-itself.
+one curve s = b0 + b1 |I| for all wheels is fitted to all floors but one and judged on the remaining
+floor. The curve is compared with a constant slip fitted to the same floors, and with a curve fitted
+to the remaining floor itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,8 +33,8 @@ SURE_STDS, SMALL_NATS = 2.0, 4.0
 """Smallest relevant difference of two models: in standard errors, and in nats over all runs.
 
 Below four nats in total, models predict equally well and the standard error of their difference is
-unreliable: a model with one superfluous number, for example, loses a little in every run. Source:
-Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296."""
+unreliable: a model with one superfluous parameter, for example, loses a little in every run.
+Source: Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class RankedModel:
         se: standard error of the difference over runs.
         se_clustered: standard error of the difference over sectors of headings.
         verdict: `best`, `tied` or `worse`.
-        endpoint_error: mean end-point error, over the straight-line displacement of a run.
-        endpoint_error_se: standard error of that mean over sectors of headings.
+        endpoint_error: mean end-point error, divided by the straight-line displacement of the run.
+        endpoint_error_se: standard error of `endpoint_error` over sectors of headings.
         energy_score: mean energy score [m].
-        coverage50, coverage90: share of runs that ended in their 50 % or 90 % region.
+        coverage50, coverage90: fraction of runs that ended in their 50 % or 90 % region.
         heading_error_median_deg: median heading error [deg].
     """
 
@@ -77,7 +77,7 @@ class Ranking:
         best: name of the best model.
         sentence: summary for a reader.
         band50, band90: range in which the coverage of calibrated forecasts lies, see `_band`.
-        models: scores of every model, by name.
+        models: scores of every model, keyed by name.
     """
 
     runs: int
@@ -90,11 +90,12 @@ class Ranking:
 
 
 def ranking(runs: Sequence[ScoredRun]) -> dict[str, Ranking]:
-    """Return, for every floor, the models' scores, differences to the best and verdicts.
+    """Return, for every floor, the models' scores, their differences to the best one, and verdicts.
 
-    The score is the expected log predictive density of a run's logged poses [nats per run], every
-    run predicted by a fit without it. A model is tied with the best where the difference is less
-    than `SURE_STDS` clustered standard errors or, over all runs, less than `SMALL_NATS` nats.
+    The score is the expected log predictive density of a run's logged poses [nats per run], where
+    every run is predicted by a fit that does not include it. A model is tied with the best one if
+    the difference is less than `SURE_STDS` clustered standard errors or, summed over all runs, less
+    than `SMALL_NATS` nats.
     """
     return {floor: _floor(floor, mine) for floor, mine in by_floor(runs).items()}
 
@@ -186,7 +187,7 @@ class Comparison:
     """Ranking of slip models on each floor; `print` shows a sentence per floor.
 
     Attributes:
-        floors: ranking by floor.
+        floors: ranking, keyed by floor.
         question: key of `folds.QUESTIONS`, by which runs were held out together.
     """
 
@@ -212,9 +213,9 @@ def compared(
     parts: int,
     quiet: bool = False,
 ) -> Comparison:
-    """Return the comparison of every slip model, fold by fold, for a problem of all runs.
+    """Compare all slip models, fold by fold; `problem` is that of all runs.
 
-    The other arguments and errors are those of `Fit.compare`.
+    Further arguments, and errors, are those of `Fit.compare`.
     """
     fold = folds_of(data, question, parts)
     if (fold < 0).all():
@@ -228,7 +229,7 @@ def compared(
 
 
 LEAST_SPEED_RATIO = 0.2
-"""A wheel is used in a window only if its speed exceeds this ratio of that of the fastest wheel."""
+"""A wheel is used in a window if its speed is at least this fraction of the fastest wheel's."""
 VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "all": (LEAST_SPEED_RATIO, False, False),
     "slower wheels too": (0.1, False, False),
@@ -236,23 +237,23 @@ VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "as built only": (LEAST_SPEED_RATIO, True, False),
     "0 < s <= 1, I > 0.25 A only": (LEAST_SPEED_RATIO, False, True),
 }
-"""Choices of rows for `transfer`, by name: (least relative wheel speed, main load set-up only,
-filter of the 2021 paper).
+"""Choices of rows for `transfer`, keyed by name: (smallest relative wheel speed, main load set-up
+only, filter of the 2021 paper).
 
 The filter truncates the slip and therefore underestimates the remaining errors.
 """
 
 
 def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
-    """Return leave-one-floor-out errors of slip, by the variants of rows; empty for one floor.
+    """Return leave-one-floor-out errors of slip, keyed by `VARIANTS`; empty for a single floor.
 
-    A variant has errors after subtracting the curve of the other floors (`pooled`), the mean slip
-    of the other floors (`constant`), and the floor's own curve (`per_surface`), and the `count` of
-    rows. Errors are the root mean square over all `rows`, that of `each` floor, and the mean of the
-    latter over `floors`.
+    A variant holds the errors of slip less the curve of the other floors (`pooled`), less the mean
+    slip of the other floors (`constant`) and less the floor's own curve (`per_surface`), and the
+    `count` of rows. Each error is given as the root mean square over all `rows`, as that over the
+    rows of `each` floor, and as the mean of the values of `each` (`floors`).
 
-    A row is one wheel in one window: s = 1 - J xi / (r w), xi the body twist from the camera in
-    corrected metres, I the mean magnitude of the wheel's current.
+    A row is one wheel in one window, with the slip s = 1 - J xi / (r w), where xi is the body twist
+    from the camera in corrected metres, and the mean magnitude I of the wheel's current.
     """
     if len(set(w.surface)) < 2:
         return {}

@@ -87,7 +87,7 @@ def chords(path: Float[np.ndarray, "run edge 3"]) -> list[float]:
 
 
 def lengths(path: Float[np.ndarray, "run edge 3"]) -> list[float]:
-    """Return the length of every path, step by step [m]."""
+    """Return the length of every path, as the sum over its steps [m]."""
     return list(np.linalg.norm(np.diff(path[..., :2], axis=1), axis=2).sum(axis=1).tolist())
 
 
@@ -140,9 +140,9 @@ def mean_error(
 
         se^2 = G / (G - 1) sum_g (sum_{i in g} (x_i - mean))^2 / n^2
 
-    G is the number of clusters g, and of runs for the error over runs. Source: Cameron and Miller
-    2015, J. Human Resources 50, for a regression on a constant. With one run, or one cluster, the
-    error cannot be estimated and is nan.
+    G is the number of clusters g; for the error over runs, every run is a cluster. Source: Cameron
+    and Miller 2015, J. Human Resources 50, for a regression on a constant. With one run, or one
+    cluster, the error cannot be estimated and is nan.
     """
     n = len(value)
     gap = value - value.mean()

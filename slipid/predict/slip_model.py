@@ -40,7 +40,7 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
     chord = turned(psi, moved[..., :2])
     place = np.broadcast_to(np.asarray(robot.camera.marker_place), chord.shape)
     chord -= turned(yaw, place) - place
-    # chord = arc sinc(yaw / 2), at half the yaw to the start heading
+    # The body moves on an arc with chord = arc sinc(yaw / 2), at half the yaw to its start heading.
     arc = turned(-0.5 * yaw, chord) / np.sinc(yaw / (2 * np.pi))[..., None]
     return np.concatenate([arc, yaw[..., None]], -1) / w.dt[..., None]
 
@@ -125,7 +125,7 @@ class RobotSpec:
         )
 
     def of_shape(self, shape: Geometry) -> "RobotSpec":
-        """Return the same robot with another geometry for the conversion of encoders to twists."""
+        """Return the same robot, with encoders converted to twists by another geometry."""
         back = np.asarray(shape.pseudo_inverse())
         return replace(self, back=back, wheel_radius=float(shape.wheel_radius))
 
@@ -170,13 +170,13 @@ class RunSignals:
         return self.turn / self.dt[:, None]
 
     def rolling(self, spec: RobotSpec) -> Twists:
-        """Return the body twist without slip, from the encoders alone."""
+        """Return the body twist without slip, from the encoders only."""
         return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
     def along(self, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
         """Return the current along the wheel's motion [A]: positive if the motor drives the wheel.
 
-        For an unsigned ammeter it is the magnitude, as if the motor always drove.
+        The current of an unsigned ammeter is positive, as if the motor always drove the wheel.
 
         Raises:
             ValueError: no current was logged.
@@ -189,8 +189,8 @@ class RunSignals:
     def torque(self, spec: RobotSpec, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
         """Return the torque characterising variable M of the 2021 paper [N m].
 
-        M = U I / w with the voltage U = C_e w + R I, the current I and the shaft speed w. It is
-        computed as C_e I + R I^2 w / (w^2 + w0^2), which is finite at rest, with w0 = `rest`. It is
+        M = U I / w with the voltage U = C_e w + R I, the current I and the shaft speed w. So that M
+        is finite at rest, it is computed as C_e I + R I^2 w / (w^2 + w0^2) with w0 = `rest`. M is
         positive if the motor drives the wheel.
         """
         amps, shaft = self.along(spec), np.abs(spec.gear_ratio * self.speed)
@@ -269,8 +269,8 @@ class PredictedRun:
             is its covariance.
         slipping: score of each step that increases with the confidence that the robot slips; None
             to derive it from the difference of predicted and encoder twists.
-        floors: probability of each floor in every step, by name; None for a model that does not
-            infer floors.
+        floors: probability of each floor in every step, keyed by floor; None for a model that does
+            not infer floors.
         power: electric power of all motors in every step [W], predicted without the currents; None
             for a model that does not predict it.
     """
@@ -307,16 +307,16 @@ class SlipModel(abc.ABC):
 
     @abc.abstractmethod
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        """Return predictions of runs that were not fitted, from their signals alone."""
+        """Return predictions of runs that were not fitted, from only their signals."""
 
     @property
     @abc.abstractmethod
     def numbers(self) -> int:
-        """Count of fitted numbers."""
+        """Number of fitted coefficients."""
 
 
 def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:
-    """Return the index of the first step of every group of neighbours, each about `seconds` [s]."""
+    """Return the first step of every group of neighbouring steps, each about `seconds` [s] long."""
     count = max(1, round(float(dt.sum()) / seconds))
     number = np.minimum((np.cumsum(dt) - 0.5 * dt) / dt.sum() * count, count - 1).astype(int)
     return np.flatnonzero(np.diff(number, prepend=-1))
@@ -336,7 +336,7 @@ def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, 
     """Return the poses of a path from the origin, with a constant twist per step (exact SE(2))."""
     heading = np.concatenate([[0.0], np.cumsum(twist[:, 2] * dt)])
     middle = 0.5 * (heading[1:] + heading[:-1])
-    # chord = arc sinc(yaw / 2), at half the yaw to the start heading
+    # Each step is an arc with chord = arc sinc(yaw / 2), at half the yaw to its start heading.
     chord = np.sinc(np.diff(heading) / (2 * np.pi)) * dt
     step = turned(middle, twist[:, :2] * chord[:, None])
     place = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
@@ -344,7 +344,7 @@ def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, 
 
 
 def relative_to_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
-    """Return poses in the frame of the first of them."""
+    """Return the poses of a path in the frame of its first pose."""
     offset = path - path[0]
     return np.column_stack([turned(-path[0, 2], offset[:, :2]), offset[:, 2]])
 

@@ -32,12 +32,12 @@ from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 class FloorModels:
     """A slip model fitted separately for every floor.
 
-    It predicts marker increments in corrected metres.
+    The model predicts marker increments in metres as corrected by the camera model.
 
     Attributes:
         model: the slip model, not fitted.
-        fitted: the model fitted to the windows of each floor, or of each `floor@load` for a model
-            that is fitted by load set-up.
+        fitted: the fitted models, keyed by floor, or by `floor@load` for a model that is fitted to
+            each load set-up separately.
     """
 
     model: TwistModel
@@ -50,11 +50,11 @@ class FloorModels:
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """Fitted numbers by key of `fitted`; together with the name they restore the models."""
+        """Fitted coefficients, keyed as `fitted`; with the name they restore the models."""
         return {key: m.coefficients for key, m in self.fitted.items() if m.coefficients is not None}
 
     def with_state(self, state: Mapping[str, np.ndarray]) -> "FloorModels":
-        """Return the models with these numbers."""
+        """Return the models with these coefficients."""
         models = {
             k: replace(self.fitted.get(k, self.model), coefficients=v) for k, v in state.items()
         }
@@ -105,7 +105,7 @@ class FloorModels:
         return floors[surface]
 
     def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
-        """Return the precision of each key's numbers that is due to ridges and bounds, not data."""
+        """Return the precision that ridges and bounds give to coefficients, keyed as `fitted`."""
         spec, parts = RobotSpec.of(robot), self._parts(w)
         return {
             key: model.stiffness(training_windows(parts[key], robot), spec)
@@ -113,13 +113,13 @@ class FloorModels:
         }
 
     def _parts(self, w: Windows) -> dict[str, Windows]:
-        """Return the windows by the key of the model that is fitted to them."""
+        """Return the windows, keyed by the key of the model that is fitted to them."""
         keys = np.array(setups(w) if self.model.by_load else w.surface)
         return {k: w.segments(np.flatnonzero(keys == k)) for k in dict.fromkeys(keys.tolist())}
 
 
 def steps_of(w: Windows) -> Steps:
-    """Return the windows as steps, every segment as one run; currents are magnitudes."""
+    """Convert windows to steps: every segment becomes one run, and currents their magnitudes."""
     drives = w.turn.shape[-1]
     signals = RunSignals(
         name="windows",
@@ -154,13 +154,14 @@ def slip_models(
     """Return every slip model that the logs and the wheels allow, not fitted.
 
     The model `paper` is the form that the authors of the 2021 paper ran on their robot; its
-    threshold and the knots of the spline suit motors of that size.
+    threshold and the knots of the spline suit motors of the size of theirs.
 
     Args:
         shape: geometry of the robot as in its config. For wheels that do not determine the twist
             there are other models than for those that do.
         has_current: True if currents are logged.
-        together: group number of every run, by which a model's inner cross-validation holds out.
+        together: group number of every run; a model's inner cross-validation holds out the runs of
+            a group together.
     """
     models: list[TwistModel] = [nominal(shape), Encoder()]
     if shape.determines_twist:
@@ -171,7 +172,7 @@ def slip_models(
 
 
 def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]:
-    """Return the models for wheels that determine the twist: by wheel, by direction of travel."""
+    """Return models for wheels that determine the twist: slip curves, and a table of headings."""
     out: list[TwistModel] = [CurveModel("constant", powers(0))]
     if has_current:
         out += [
@@ -188,7 +189,7 @@ def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]
 
 
 def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> list[FloorModels]:
-    """Return slip models from their states by name, as in `{model.name: model.state}`."""
+    """Return slip models from their states, keyed by name: `{model.name: model.state}`."""
     known = {model.name: model for model in slip_models(shape, has_current=True)}
     if unknown := sorted(set(states) - set(known)):
         raise ValueError(f"no model '{unknown[0]}'; expected one of {', '.join(known)}")
@@ -207,8 +208,8 @@ class ByFloor(SlipModel):
     Attributes:
         method: the model, not fitted.
         pooled: True if floors and loads are ignored and the model is fitted once to all runs.
-        fitted: the model fitted to the runs of each group, by the group's name, the largest group
-            first; the name of the group of all runs is None.
+        fitted: the model fitted to the runs of each group, keyed by the group's name, the largest
+            group first; the name of the group of all runs is None.
     """
 
     method: SlipModel

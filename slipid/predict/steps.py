@@ -62,7 +62,7 @@ class Steps:
         return cls(signals, np.cumsum([0, *(len(run) for run in runs[:-1])]))
 
     def at_lag(self, lag: float) -> "Steps":
-        """Return the same steps at another lag [s], to first order; unchanged if it is known."""
+        """Return the steps at another lag [s], to first order; unchanged without `speed_change`."""
         if self.speed_change is None:
             return self
         turn = self.signals.turn - (lag - self.lag) * self.speed_change
@@ -103,7 +103,7 @@ class Steps:
         return x[run, step]
 
     def ends(self, twist: Twists) -> Float[np.ndarray, "run 3"]:
-        """Return the pose at each run's end, relative to its start [m, m, rad], from all twists."""
+        """Return each run's end pose relative to its start [m, m, rad], given all steps' twists."""
         return np.stack([run.path[-1] for run in self.predicted(twist)])
 
     def _runs(self, values: np.ndarray) -> list[np.ndarray]:
@@ -158,7 +158,7 @@ class TrainingWindows:
     def errors(self, twist: Twists, spec: RobotSpec) -> Float[np.ndarray, " row"]:
         """Return the displacement errors of all windows [m], from predicted twists of all steps.
 
-        There are three per window; that in yaw is multiplied by the base radius.
+        There are three errors per window; the yaw error is multiplied by the base radius.
         """
         return np.asarray(((self.means(twist) - self.twist) * self._scale(spec)).ravel())
 
@@ -171,9 +171,9 @@ class TrainingWindows:
     ) -> tuple[Float[np.ndarray, "window 3 k"], Float[np.ndarray, "window 3"]]:
         """Return linear equations for the coefficients of a slip model, three for each window.
 
-        They equate a weighted sum of `parts` to the encoders' displacement less the measured one:
-        sum_k coefficient_k part_k dt = (rolling - twist) dt, with yaw times the base radius. The
-        results are part_k dt and the right side [m].
+        For each window, a weighted sum of `parts` equals the encoders' displacement less the
+        measured one: sum_k coefficient_k part_k dt = (rolling - twist) dt, with yaw times the base
+        radius. The results are part_k dt and the right side [m].
         """
         gap = self.means(self.steps.signals.rolling(spec)) - self.twist
         scale = self._scale(spec)
@@ -185,10 +185,10 @@ def scaled_least_squares(
 ) -> Float[np.ndarray, " k"]:
     """Return the least-squares solution, computed with columns scaled to unit norm.
 
-    Of several solutions it is the one with the smallest norm of the scaled coefficients.
+    If there are several solutions, the result is the minimum-norm one in scaled coefficients.
     """
     size = np.linalg.norm(a, axis=0)
-    # a column that contains only rounding errors is ignored
+    # Division by an infinite norm ignores a column that contains only rounding errors.
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
     return np.asarray(np.linalg.lstsq(a / size, b, rcond=1e-6)[0] / size)
 
@@ -198,11 +198,11 @@ class TwistModel(SlipModel, abc.ABC):
     """A slip model that predicts the body twist of every step from the signals of its run.
 
     Attributes:
-        coefficients: fitted numbers; None before a fit, and for a model without fitted numbers.
+        coefficients: fitted coefficients; None before a fit, and for a model that has none.
     """
 
     learns: ClassVar[bool] = True
-    """True if the model has fitted numbers."""
+    """True if the model has coefficients to fit."""
     by_load: ClassVar[bool] = False
     """True if `slipid compare` fits every load set-up of a floor separately."""
     coefficients: np.ndarray | None = field(default=None, kw_only=True)
@@ -216,7 +216,7 @@ class TwistModel(SlipModel, abc.ABC):
         """Return the body twist of every step [m/s, m/s, rad/s]."""
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """Return the precision of the flat coefficients due to ridges and bounds, not to data."""
+        """Return the precision of the flattened coefficients that ridges and bounds contribute."""
         return np.zeros((self.numbers, self.numbers))
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "TwistModel":
@@ -232,7 +232,7 @@ class TwistModel(SlipModel, abc.ABC):
 
     @property
     def known(self) -> np.ndarray:
-        """The fitted numbers as a flat array.
+        """The fitted coefficients.
 
         Raises:
             ValueError: the model is not fitted.

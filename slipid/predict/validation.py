@@ -35,7 +35,7 @@ class ScoredRun:
         chord: straight-line displacement measured by the camera [m].
         path: path length measured by the camera [m].
         measured_end: measured pose at the end (x, y [m], yaw [rad]).
-        models: scores by model.
+        models: scores, keyed by model.
         session: session of the run.
     """
 
@@ -110,7 +110,7 @@ class Validation:
 
     @property
     def summary(self) -> dict[str, dict[str, FloorSummary]]:
-        """Mean scores by floor and model; another load set-up counts as a separate floor."""
+        """Mean scores, keyed by floor (with the load set-up as in `by_floor`) and model."""
         return {
             name: {m: _mean([run.models[m] for run in runs]) for m in runs[0].models}
             for name, runs in by_floor(self.runs).items()
@@ -198,9 +198,9 @@ def finite(x: float) -> float | None:
 
 
 def by_floor(runs: Sequence[ScoredRun]) -> dict[str, list[ScoredRun]]:
-    """Return the runs of every floor; runs with other load set-ups than the main one are separate.
+    """Return the runs, keyed by floor, or by `<floor>@<load>` without the main load set-up.
 
-    Their key is `<floor>@<load>`; the main set-up is that of `score.main_load`.
+    The main load set-up is that of `score.main_load`.
     """
     groups: dict[str, list[ScoredRun]] = {}
     for name, run in zip(

@@ -532,7 +532,7 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     fit = load(out)
     assert fit.mixed is None
     assert fit.refused["reason"] in fit.messages
-    assert "as if all on soft" in fit.refused["reason"]
+    assert "as if all wheels were on soft" in fit.refused["reason"]
     by_map, soft = fit.refused["learnt"]["speed"], fit.refused["as_if"]["soft"]["speed"]
     assert soft < 0.5 * by_map
     for errors in fit.refused["floors"].values():  # its noise absorbs what the map has wrong

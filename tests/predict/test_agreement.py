@@ -59,7 +59,7 @@ def test_floors_that_are_worse_are_named_and_no_others():
         0.02,
         {"gray": 0.03, "green": 0.03},
     )
-    assert "gray from 1.3 to 7.0 % of the distance driven" in reason
+    assert "gray grow from 1.3 to 7.0 % of the displacement" in reason
     assert "green" not in reason
     assert "map may be wrong" in reason
 
@@ -69,7 +69,7 @@ def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green
     reason = contradiction(FINE, STILL, 0.02, {"gray": 0.05, "green": green})
     assert (reason is not None) == refused
     if refused:
-        assert "20.0 mm/s by their map, 15.0 mm/s as if all on green" in reason
+        assert "20.0 mm/s with their map, but 15.0 mm/s as if all wheels were on green" in reason
         assert "map may be wrong" in reason
 
 

@@ -330,7 +330,7 @@ def test_runs_that_nothing_could_be_fitted_for_are_never_left_out(logs):
     assert sorted(set(folds_of(collect(logs), "speeds"))) == [0, 1]
     assert set(folds_of(collect(slow), "speeds")) == {-1}
     assert set(folds_of(collect([logs[0]]), "sectors")) == {-1}
-    with pytest.raises(DataError, match="expected some of sectors, speeds, random"):
+    with pytest.raises(DataError, match="expected one of sectors, speeds, random"):
         folds_of(collect(logs), "luck")
 
 
