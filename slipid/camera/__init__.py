@@ -1,1 +1,1 @@
-"""Camera calibration, poses and floor maps from pictures: the only package that needs OpenCV."""
+"""Camera calibration, poses and floor maps from images: the only package that needs OpenCV."""

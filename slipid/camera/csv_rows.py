@@ -7,7 +7,7 @@ from slipid.support.errors import DataError
 
 
 def csv_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
-    """Return the cells of each row of a CSV file with its line number, without comments.
+    """Return each row of a CSV file as its line number and its cells; `#` lines are omitted.
 
     Cells are separated by commas, semicolons or tabs, whichever the first row has most of.
 
@@ -16,7 +16,7 @@ def csv_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
         expected: description of the file's content, for messages.
 
     Raises:
-        DataError: the file cannot be read, or is not a text in UTF-8.
+        DataError: the file cannot be read, or is not text in UTF-8.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

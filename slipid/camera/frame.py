@@ -15,8 +15,8 @@ from slipid.camera.opencv import Grey, cv2
 from slipid.support.errors import DataError, bad_data
 
 LOST_SHARE = 0.02
-"""Largest fraction of a file's announced frames that may be missing without a note [1]; some
-formats only estimate their number."""
+"""Largest fraction of a file's announced frames that may be missing without a message [1]; some
+file formats only estimate how many frames they contain."""
 UNEVEN_RATE = 0.2
 """Largest relative difference of an interval between frames from the median interval for which the
 frame rate still counts as even [1]."""
@@ -26,12 +26,12 @@ READ_AHEAD = 8
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture of a video.
+    """One image of a frame source, such as a video.
 
     Attributes:
         index: number of the frame, from 0.
-        time: time at which it was taken [s].
-        grey: grey levels of its pixels, from 0 to 255.
+        time: time at which the frame was taken [s].
+        grey: grey levels of the frame's pixels, from 0 to 255.
     """
 
     index: int
@@ -41,14 +41,14 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FrameSource(ABC):
-    """A video, a folder of pictures or a device that supplies frames.
+    """A video, a folder of images or a device that supplies frames.
 
     Attributes:
         name: name of the source in messages.
         image_px: width and height of every frame [pixel].
         count: expected number of frames; None if it is not known.
-        exact: True if `count` is exact, as it is if a time is given for each frame.
-        identity: text that differs if the content differs, such as name, size and date of a file.
+        exact: True if `count` must be met exactly, because a time is given for each frame.
+        identity: text that changes when the frames change, such as name, size and date of a file.
     """
 
     name: str
@@ -63,16 +63,22 @@ class FrameSource(ABC):
 
 
 def cut_off(source: FrameSource, count: int) -> str | None:
-    """Return a sentence if a source ended too early, after `count` frames; None otherwise."""
+    """Return a sentence for the user if a source gave a wrong number of frames, else None.
+
+    Up to `LOST_SHARE` of an estimated number of frames may be missing.
+    """
     if source.count is None or count == source.count:
         return None
     if source.exact:
-        return f"{source.name}: {count} frames, but {source.count} times; expected a time for each"
+        return (
+            f"{source.name}: {count} frames, but {source.count} times; expected one time for each "
+            "frame"
+        )
     if count >= (1 - LOST_SHARE) * source.count - 1:
         return None
     return (
-        f"{source.name}: ends after frame {count} of {source.count}; the file was cut off or is "
-        "damaged there"
+        f"{source.name}: the frames end after {count} of {source.count}; the file was cut off or "
+        "is damaged there"
     )
 
 
@@ -83,7 +89,7 @@ def stamp(path: Path) -> tuple[str, int, int]:
 
 
 def grey_of(picture: np.ndarray) -> Grey:
-    """Return the grey levels of a picture, which may be in blue, green, red or already grey."""
+    """Return the grey levels of an image whose channels are blue, green, red or already grey."""
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.asarray(picture).reshape(picture.shape[:2])
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
@@ -93,22 +99,26 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
     """Return the times [s] of frames 0, 1, 2, ... from a CSV file with columns frame and time.
 
     Raises:
-        DataError: the file is unreadable or has other columns, frames are missing, or times do not
-            increase.
+        DataError: the file is unreadable, its first columns are not frame and time, frames are
+            missing, or times do not increase.
     """
     rows = csv_rows(path, "times of frames, in the columns frame, time [s]")
     if not rows or rows[0][1][:2] != ["frame", "time"]:
-        raise bad_data(path, "other columns", "the columns frame, time [s]", row=1)
+        raise bad_data(
+            path, "first columns other than frame and time", "the columns frame, time [s]", row=1
+        )
     times: list[float] = []
     for line, row in rows[1:]:
         try:
             number, at = int(row[0]), float(row[1])
         except (ValueError, IndexError):
-            raise bad_data(path, f"{','.join(row)!r}", "a frame and its time", row=line) from None
+            raise bad_data(
+                path, f"{','.join(row)!r}", "a frame number and its time in seconds", row=line
+            ) from None
         if number != len(times):
             raise bad_data(path, f"frame {number}", f"frame {len(times)}", row=line)
         if not np.isfinite(at) or (times and at <= times[-1]):
-            raise bad_data(path, f"time {at:g}", "times that increase", row=line)
+            raise bad_data(path, f"time {at:g}", "finite times that increase", row=line)
         times.append(at)
     return np.array(times)
 
@@ -120,7 +130,7 @@ def even_times(count: int, fps: float) -> Float[np.ndarray, " frame"]:
         DataError: the rate is not a positive number.
     """
     if not 0 < fps < np.inf:
-        raise DataError(f"--fps {fps:g}; expected frames per second")
+        raise DataError(f"--fps {fps:g}; expected a positive number of frames per second")
     return np.arange(count) / fps
 
 
@@ -133,13 +143,13 @@ def uneven(times: Sequence[float] | Float[np.ndarray, " frame"]) -> str | None:
     if most <= (1 + UNEVEN_RATE) * usual and least >= (1 - UNEVEN_RATE) * usual:
         return None
     return (
-        f"frames come every {1e3 * least:.0f} to {1e3 * most:.0f} ms, mostly {1e3 * usual:.0f}: a "
-        "variable frame rate; times are those of the frames themselves"
+        f"frames come every {1e3 * least:.0f} to {1e3 * most:.0f} ms, mostly {1e3 * usual:.0f}: "
+        "the frame rate varies, so each pose has the time of its own frame"
     )
 
 
 def read_ahead(frames: Iterator[Frame]) -> Generator[Frame]:
-    """Yield the same frames, decoded in advance in a thread.
+    """Yield the given frames unchanged, decoded in advance in a thread.
 
     Errors of the thread are raised here. Decoding ends with the last frame, or when this generator
     is closed.

@@ -1,4 +1,4 @@
-"""Frames from the file, folder or device that a user names, and still pictures from videos."""
+"""Frames from the file, folder or device that a user gives, and still images from videos."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,8 @@ from slipid.support.errors import DataError
 MOST_BROKEN = 25
 """Number of consecutive frames that cannot be decoded after which a video counts as ended."""
 MEDIAN_FRAMES = 25
-"""Approximate number of frames of a video whose median is its still picture."""
+"""Approximate number of frames of a video whose pixelwise median gives a still image; at most
+twice as many are used."""
 Times = Float[np.ndarray, " frame"]
 """Times of frames [s]."""
 
@@ -33,8 +34,9 @@ class Capture:
         self._capture = cv2.VideoCapture(int(place) if place.isdigit() else place)
         if not self._capture.isOpened():
             raise DataError(
-                f"{place}: OpenCV cannot open it; expected a video in a format it knows, or a "
-                "camera that is plugged in (a recording that was cut off may have lost its index)"
+                f"{place}: OpenCV cannot open this source; expected a video in a format that "
+                "OpenCV reads, or a camera that is plugged in (a recording that was cut off may "
+                "have lost its index)"
             )
 
     def next_picture(self, decode: bool = True) -> np.ndarray | None:
@@ -66,8 +68,8 @@ class Video(FrameSource):
     """A video file, with its own frame times or with given ones.
 
     Attributes:
-        times: given time of each frame [s]; None to use those of the file, or `fps`.
-        fps: given frame rate from which times are computed [1/s]; None without one.
+        times: given time of each frame [s]; None to use `fps` or the times in the file.
+        fps: given frame rate from which times are computed [1/s]; None if no rate is given.
     """
 
     times: Times | None
@@ -100,7 +102,7 @@ class Video(FrameSource):
         """Yield the frames, beginning with number `first`; earlier ones are not decoded.
 
         Raises:
-            DataError: the file has no times, times do not increase, or too few were given.
+            DataError: times in the file do not increase, or fewer times than frames were given.
         """
         before = -np.inf
         with closing(Capture(self.name)) as capture:
@@ -111,8 +113,8 @@ class Video(FrameSource):
                 at = self._time(k, capture)
                 if at <= before and k >= first:
                     raise DataError(
-                        f"{self.name}: frame {k} has time {at:.4f} s after {before:.4f} s; it "
-                        "has no times that increase: expected --fps, or --times FILE"
+                        f"{self.name}: frame {k} has time {at:.4f} s after {before:.4f} s; the "
+                        "video's times do not increase: expected --fps, or --times FILE"
                     )
                 before = at
                 if k >= first:
@@ -126,17 +128,17 @@ class Video(FrameSource):
             return capture.value(cv2.CAP_PROP_POS_MSEC) / 1000.0
         if k >= len(self.times):
             raise DataError(
-                f"{self.name}: more than the {len(self.times)} frames that have a time; expected "
-                "a time for each"
+                f"{self.name}: more frames than the {len(self.times)} given times; expected one "
+                "time for each frame"
             )
         return float(self.times[k])
 
 
 @dataclass(frozen=True, eq=False)
 class Device(FrameSource):
-    """A camera connected to this computer; frame times are the computer's, from the first frame on.
+    """A camera connected to this computer, whose clock gives the frame times from the first frame.
 
-    Every recording has its own identity, since its frames cannot be read again.
+    Every recording has its own `identity`, since its frames cannot be read again.
 
     Attributes:
         place: number or path of the device.
@@ -157,7 +159,7 @@ class Device(FrameSource):
         return cls(name, size_of(first), None, False, f"{place} {time.time_ns()}", place, seconds)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the frames from now on until the recording's duration is over."""
+        """Yield frames from now until `seconds` have passed; `first` has no effect on a device."""
         began: float | None = None
         with closing(Capture(self.place)) as capture:
             for k in numbers():
@@ -171,11 +173,11 @@ class Device(FrameSource):
 
 @dataclass(frozen=True, eq=False)
 class PictureFolder(FrameSource):
-    """Pictures in the order of their file names, all of one size.
+    """Images in the order of their file names, all of one size.
 
     Attributes:
-        paths: files of the pictures.
-        times: time of each picture [s].
+        paths: files of the images.
+        times: time of each image [s].
     """
 
     paths: tuple[Path, ...]
@@ -183,40 +185,41 @@ class PictureFolder(FrameSource):
 
     @classmethod
     def at(cls, folder: Path, fps: float | None, times: Times | None) -> "PictureFolder":
-        """Return the pictures in a folder, with a frame rate [1/s] or given times [s].
+        """Return the images in a folder, with a frame rate [1/s] or given times [s].
 
         Raises:
-            DataError: there is no picture, or the numbers of pictures and times differ.
+            DataError: there is no image, or the numbers of images and times differ.
         """
         paths = pictures_in(folder)
         if times is None:
             if fps is None:
-                raise DataError(f"{folder}: pictures have no times; expected --fps or --times FILE")
+                raise DataError(f"{folder}: images have no times; expected --fps or --times FILE")
             times = even_times(len(paths), fps)
         if len(times) != len(paths):
             raise DataError(
-                f"{folder}: {len(paths)} pictures and {len(times)} times; expected one each"
+                f"{folder}: {len(paths)} images and {len(times)} times; expected one time for each "
+                "image"
             )
         return cls.of(folder, paths, times)
 
     @classmethod
     def of(cls, place: Path, paths: Sequence[Path], times: Times) -> "PictureFolder":
-        """Return pictures of the first one's size.
+        """Return a source of images that all have the size of the first image.
 
         Raises:
-            DataError: the first file is not a picture.
+            DataError: the first file is not an image.
         """
         size, identity = size_of(read_picture(paths[0])), repr([stamp(path) for path in paths])
         return cls(str(place), size, len(paths), True, identity, tuple(paths), times)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the pictures from number `first`; raise `DataError` if one has another size."""
+        """Yield the images from number `first`; raise `DataError` if one has another size."""
         for k in range(first, len(self.paths)):
             picture = read_picture(self.paths[k])
             if size_of(picture) != self.image_px:
                 (w, h), (width, height) = size_of(picture), self.image_px
                 raise DataError(
-                    f"{self.paths[k]}: {w} x {h} pixels; expected {width} x {height} as "
+                    f"{self.paths[k]}: {w} x {h} pixels; expected {width} x {height}, the size of "
                     f"{self.paths[0].name}"
                 )
             yield Frame(k, float(self.times[k]), grey_of(picture))
@@ -225,7 +228,7 @@ class PictureFolder(FrameSource):
 def open_source(
     place: str, fps: float | None = None, times: Path | None = None, seconds: float | None = None
 ) -> FrameSource:
-    """Return the frames of a video file, a folder of pictures or a device.
+    """Return the frames of a video file, a folder of images or a device.
 
     Args:
         place: a file, a folder, or a device given by its number or its path such as /dev/video0.
@@ -234,23 +237,32 @@ def open_source(
         seconds: duration of the recording from a device [s]; None for other sources.
 
     Raises:
-        DataError: the source cannot be read, has no times, or options do not fit it.
+        DataError: the source cannot be read, has no times, or an option does not apply to it.
     """
     if fps is not None and times is not None:
-        raise DataError("--fps and --times at once; expected one of them")
+        raise DataError("both --fps and --times are given; expected one of them")
     path = Path(place)
     if place.isdigit() or place.startswith("/dev/video"):
         if seconds is None or not 0 < seconds < float("inf"):
-            raise DataError(f"device {place}: expected --seconds, the length of the recording")
+            raise DataError(
+                f"device {place}: no duration; expected --seconds with the recording's duration, "
+                "a positive number"
+            )
         if fps is not None or times is not None:
-            raise DataError(f"device {place}: times are this computer's; omit --fps and --times")
+            raise DataError(
+                f"device {place}: --fps or --times is given, but this computer's clock times a "
+                "device; omit both"
+            )
         return Device.at(place, seconds)
     if seconds is not None:
-        raise DataError(f"--seconds is for devices, not for {place}; a video is read to its end")
+        raise DataError(
+            f"--seconds is for devices, not for {place}; a video or folder is read to its end: "
+            "omit --seconds"
+        )
     try:
         size = path.stat().st_size
     except (OSError, ValueError):
-        expected = "a video or a folder of pictures"
+        expected = "a video or a folder of images"
         raise DataError(f"{path}: no such file or folder; expected {expected}") from None
     given = None if times is None else read_times(times)
     if path.is_dir():
@@ -264,13 +276,13 @@ def open_source(
 
 
 def still(path: Path) -> np.ndarray:
-    """Return a picture, or the median of a video's frames, as rows, columns and blue, green, red.
+    """Return an image, or the pixelwise median of a video's frames, in blue, green, red.
 
-    An object that moves through a video does not appear in the median, unless it stays in one
-    place for half of the time.
+    An object that moves through a video appears in the median only if it stays at one spot for at
+    least half of the time.
 
     Raises:
-        DataError: the file is neither a picture nor a video.
+        DataError: the file is neither an image nor a video.
     """
     if is_picture(path) or not path.is_file() or not path.stat().st_size:
         return read_picture(path)
@@ -283,8 +295,9 @@ def still(path: Path) -> np.ndarray:
             if picture is None:
                 break
             kept += [picture] if chosen else []
-            if len(kept) == 2 * MEDIAN_FRAMES:  # length unknown or wrong: keep every second frame
+            if len(kept) == 2 * MEDIAN_FRAMES:
+                # the video is longer than announced: thin the frames to limit memory
                 kept, every = kept[::2], 2 * every
     if not kept:
-        raise DataError(f"{path}: no frame that OpenCV can decode; expected a picture or a video")
+        raise DataError(f"{path}: no frame that OpenCV can decode; expected an image or a video")
     return np.median(np.stack(kept), axis=0).astype(np.uint8)

@@ -13,16 +13,17 @@ from jaxtyping import Bool, Float, Int, UInt8
 from slipid.support.errors import DataError, did_you_mean
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""Suffixes by which pictures are recognised; a picture of a board may have any."""
+"""File suffixes by which images are recognised in folders and next to videos; an image file that a
+user gives directly for camera calibration may have any suffix."""
 NEARLY_MOST = 0.8
-"""Fraction of the largest number of markers detected with any dictionary [1]; the smallest
-dictionary that reaches it is chosen."""
+"""Fraction of the best dictionary's marker count [1]: of all dictionaries that detect at least this
+fraction, the smallest one is chosen."""
 Mask = Bool[np.ndarray, "row column"]
-"""Boolean mask over the pixels of a picture or the cells of a grid."""
+"""Boolean mask over the pixels of an image or the cells of a grid."""
 Labels = Int[np.ndarray, "row column"]
 """Number of the surface or patch in each cell of a grid."""
 Grey = UInt8[np.ndarray, "row column"]
-"""Grey levels of a picture, from 0 to 255."""
+"""Grey levels of an image, from 0 to 255."""
 
 
 @cache
@@ -37,7 +38,7 @@ def _opencv() -> ModuleType:
         import cv2
     except ImportError as error:
         raise DataError(
-            f"pictures need OpenCV ({error}); expected: pip install 'slipid[camera]'"
+            f"images need OpenCV ({error}); expected: pip install 'slipid[camera]'"
         ) from error
     if not hasattr(getattr(cv2, "aruco", None), "CharucoDetector"):
         raise DataError(
@@ -45,7 +46,8 @@ def _opencv() -> ModuleType:
             "opencv-contrib-python-headless, and no other build of OpenCV beside it"
         )
     log = getattr(getattr(cv2, "utils", None), "logging", None)
-    if log is not None:  # our own messages say what is wrong with a file
+    if log is not None:
+        # slipid's own messages tell the user what is wrong with a file
         log.setLogLevel(log.LOG_LEVEL_SILENT)
     return cv2
 
@@ -87,56 +89,59 @@ def marker_count(dictionary: str) -> int:
 
 
 def visible_markers(pictures: Sequence[np.ndarray]) -> tuple[str, list[int]]:
-    """Find the dictionary of the markers in pictures; return its name and the markers' numbers.
+    """Find the dictionary of the markers in images; return its name and the markers' numbers.
 
-    It is the smallest dictionary with at least `NEARLY_MOST` of the most detected markers.
+    The smallest dictionary is chosen that detects at least the fraction `NEARLY_MOST` of the number
+    of markers that the best dictionary detects.
     """
     numbers: dict[str, set[int]] = {}
     for name in dictionary_names():
         detector = cv2.aruco.ArucoDetector(marker_dictionary(name))
         ids = [detector.detectMarkers(np.ascontiguousarray(one))[1] for one in pictures if one.size]
         numbers[name] = {int(n) for one in ids if one is not None for n in np.ravel(one)}
-    # a large dictionary contains smaller ones, and detects a few more markers by chance
+    # a large dictionary contains the markers of smaller ones and detects a few more by chance, so
+    # the largest number of detections alone would favour it
     most = max(map(len, numbers.values()))
     best = min((n for n in numbers if len(numbers[n]) >= NEARLY_MOST * most), key=marker_count)
     return best, sorted(numbers[best])
 
 
 def is_picture(path: Path) -> bool:
-    """Return whether a file is a picture, judged by its suffix."""
+    """Return whether a file is an image, judged by its suffix."""
     return path.suffix.lower() in SUFFIXES
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """Return the pictures in a folder, sorted by name; raise `DataError` if there is none."""
+    """Return the images in a folder, sorted by name; raise `DataError` if there is none."""
     if paths := sorted(filter(is_picture, folder.iterdir())):
         return paths
-    raise DataError(f"{folder}: no picture; expected {', '.join(SUFFIXES)}")
+    raise DataError(f"{folder}: no image; expected {', '.join(SUFFIXES)}")
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Return a picture as rows, columns, and blue, green, red from 0 to 255.
+    """Return the image in a file, indexed by row, column and channel: blue, green, red, 0 to 255.
 
     Raises:
-        DataError: the file is absent, empty or not a picture.
+        DataError: the file is absent, empty or not an image.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected a picture") from error
+        raise DataError(f"{path}: {error.strerror}; expected an image") from error
     if not data:
-        raise DataError(f"{path}: the file is empty; expected a picture (PNG, JPEG, ...)")
+        raise DataError(f"{path}: the file is empty; expected an image (PNG, JPEG, ...)")
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:  # OpenCV raises this for too large pictures
+    except cv2.error:
+        # OpenCV raises for images that are too large, and returns None for other unreadable files
         picture = None
     if picture is None:
-        raise DataError(f"{path}: not a picture that OpenCV reads; expected PNG, JPEG or the like")
+        raise DataError(f"{path}: not an image that OpenCV reads; expected a PNG or JPEG file")
     return np.asarray(picture)
 
 
 def size_of(picture: np.ndarray) -> tuple[int, int]:
-    """Return width and height of a picture [pixel]."""
+    """Return width and height of an image [pixel]."""
     return int(picture.shape[1]), int(picture.shape[0])
 
 
@@ -145,10 +150,11 @@ def ideal_points(
     matrix: Float[np.ndarray, "3 3"],
     distortion: Float[np.ndarray, " coefficient"],
 ) -> Float[np.ndarray, "point 1 2"]:
-    """Return the places at which a pinhole camera of focal length 1 would show pixels.
+    """Return undistorted, normalised image coordinates: where a camera of focal length 1 sees them.
 
     The distortion is inverted by iteration to convergence.
     """
+    # up to 50 iterations, or until the reprojection error is below 1e-12
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
     iterated = getattr(cv2, "undistortPointsIter", None)
     if iterated is not None:  # OpenCV 4

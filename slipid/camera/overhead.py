@@ -1,10 +1,10 @@
-"""The overhead camera: its lens, its place above the floor, and places of pixels at a known height.
+"""The overhead camera: its lens, its pose above the floor, and positions at a known height.
 
-A pixel determines a ray, not a place. A point at height h above the floor lies where its ray
+A pixel determines a ray, not a position. A point at height h above the floor lies where its ray
 crosses the plane z = h. For a camera at height H that looks straight down, a marker at height h
-appears H / (H - h) times as far from the point below the lens as it really is. If the place of a
+appears H / (H - h) times as far from the point below the lens as it really is. If the position of a
 robot's marker is computed as if it lay on the floor, every path length is too large by that factor
-(12 % for h = 0.105 H), and the marker appears too large by the same factor, which reveals the
+(12 % for h = 0.105 H). The marker itself appears too large by the same factor, which reveals the
 mistake.
 """
 
@@ -52,7 +52,7 @@ class Lens:
         }
 
     def ideal(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Return the places at which a pinhole camera of focal length 1 would show pixels."""
+        """Return pixels as undistorted image coordinates of a camera with focal length 1 [1]."""
         flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
         if not len(flat):
             return flat.reshape(np.shape(pixels))
@@ -62,26 +62,26 @@ class Lens:
         """Raise `DataError` unless images have the size at which the lens was calibrated.
 
         Raises:
-            DataError: the size differs. It cannot be corrected, since a smaller image may be either
-                cropped or scaled.
+            DataError: the size differs. The images cannot be adapted to the lens, since a smaller
+                image may be either cropped or scaled.
         """
         if tuple(image_px) != tuple(self.image_px):
             w, h = self.image_px
             raise DataError(
                 f"{source}: images of {image_px[0]} x {image_px[1]} pixels, but the camera was "
-                f"calibrated at {w} x {h}; expected the same resolution: record at it, or "
-                "calibrate at this one"
+                f"calibrated at {w} x {h}; expected the same resolution: record at {w} x {h}, or "
+                f"calibrate at {image_px[0]} x {image_px[1]}"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class OverheadCamera:
-    """A calibrated camera above a floor, whose world has z = 0 on the floor and z up.
+    """A calibrated camera above a floor; the world's axes have z = 0 on the floor and z up.
 
     Attributes:
         lens: the lens.
-        rotation: rotation from the world's axes to the camera's: x right, y down, z away from it.
-        place: place of the lens in the world [m].
+        rotation: rotation from the world's axes to the camera's: x right, y down, z forward.
+        place: position of the lens in the world [m].
         scale_std: relative std of lengths on the floor [1]; None if it is not known.
         report: report of the calibration, as in the camera file.
     """
@@ -102,20 +102,20 @@ class OverheadCamera:
     ) -> "OverheadCamera":
         """Return a camera without distortion that looks straight down.
 
-        The world's x points to the right in the picture and y up; its origin is in the middle of
-        the picture.
+        The world's x points to the right in the image and y up; its origin is in the middle of
+        the image.
 
         Args:
-            image_px: width and height of the camera's pictures [pixel].
+            image_px: width and height of the camera's images [pixel].
             metres_per_pixel: size of a pixel on the floor [m].
             height_m: height of the lens above the floor [m].
-            turn_deg: angle by which the world's x and y are turned to the left in the picture,
-                about z [deg]; at 180, x points to the left in the picture and y down.
+            turn_deg: angle by which the world's x and y are turned to the left in the image,
+                about z [deg]; at 180, x points to the left in the image and y down.
         """
         focal, (width, height) = height_m / metres_per_pixel, image_px
         matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
         cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-        # columns are the world's x, y and z axes in the camera's axes: right, down, away
+        # columns are the world's x, y and z axes in the camera's axes: right, down, forward
         rotation = np.array([[cosine, -sine, 0], [-sine, -cosine, 0], [0, 0, -1]])
         return cls(Lens(image_px, matrix, np.zeros(4)), rotation, np.array([0.0, 0.0, height_m]))
 
@@ -125,7 +125,7 @@ class OverheadCamera:
         return float(self.place[2])
 
     def pixels(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Return the pixels at which places in the world [m] appear."""
+        """Return the pixels at which points in the world [m] appear."""
         flat = np.ascontiguousarray(points, float).reshape(-1, 1, 3)
         shape = (*np.shape(points)[:-1], 2)
         if not len(flat):
@@ -138,9 +138,9 @@ class OverheadCamera:
     def on_plane(
         self, pixels: Float[np.ndarray, "*batch 2"], height_m: float
     ) -> Float[np.ndarray, "*batch 2"]:
-        """Return x and y [m] of the points at a height [m] that appear at some pixels.
+        """Return x and y [m] of the points at a height [m] that appear at the given pixels.
 
-        They are NaN where the ray of a pixel does not descend to that height.
+        The coordinates are NaN where the ray of a pixel does not reach that height.
         """
         ideal = self.lens.ideal(pixels)
         rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ self.rotation
@@ -171,13 +171,13 @@ class OverheadCamera:
         """Return the camera in a file that `slipid calibrate` or `slipid simulate` wrote.
 
         Raises:
-            DataError: the file is absent, is not a camera file, or contains a lens alone.
+            DataError: the file is absent, is not a camera file, or contains only a lens.
         """
         return read_camera(Path(path)).above_floor(path)
 
 
 class CameraFile(Section):
-    """Content of a camera file: a lens, and its place above the floor if that is known."""
+    """Content of a camera file: a lens, and the camera's pose above the floor if it is known."""
 
     schema_: Literal["slipid.camera/1"] = Field(alias="schema")
     image_px: tuple[Pixels, Pixels]
@@ -202,12 +202,15 @@ class CameraFile(Section):
         rotation, height = np.array(self.rotation_from_world), self.place_m[2]
         right_handed = np.linalg.det(rotation) > 0
         if not (right_handed and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)):
-            raise ValueError("rotation_from_world is not a rotation")
+            raise ValueError(
+                "rotation_from_world is not a rotation; expected an orthonormal matrix with "
+                "determinant 1"
+            )
         if not (height > 0 and rotation[2, 2] < 0):
             raise ValueError(
                 f"the camera is {height:g} m high and "
-                f"{'looks up' if rotation[2, 2] >= 0 else 'looks down'}; expected it above the "
-                "floor (z up), looking down"
+                f"{'looks up' if rotation[2, 2] >= 0 else 'looks down'}; expected a camera above "
+                "the floor (z up) that looks down"
             )
         return self
 
@@ -218,10 +221,10 @@ class CameraFile(Section):
         return Lens(self.image_px, np.array(self.matrix), distortion)
 
     def above_floor(self, path: Path | str) -> OverheadCamera:
-        """Return the camera; raise `DataError` if the file `path` contains the lens alone."""
+        """Return the camera; raise `DataError` if the file `path` contains only a lens."""
         if self.rotation_from_world is None or self.place_m is None:
             raise DataError(
-                f"{path}: a lens without a place above the floor; expected rotation_from_world and "
+                f"{path}: a lens without a pose above the floor; expected rotation_from_world and "
                 "place_m: `slipid calibrate --camera FILE --floor PICTURE` adds them"
             )
         rotation, place = np.array(self.rotation_from_world), np.array(self.place_m)

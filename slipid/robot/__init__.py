@@ -1,1 +1,4 @@
-"""Software that runs on the robot: deployed robot, estimators, controllers. It needs jax alone."""
+"""Software that runs on the robot: deployed robot, estimators, controllers.
+
+It needs only jax, equinox and numpy.
+"""

@@ -25,7 +25,7 @@ from slipid.robot.trajectory import Path
 PERIOD = 0.05
 """Time between two commands [s]."""
 DURATION_FACTOR = 2.0
-"""Longest run, as a multiple of the path's duration, to which 10 s are added [1]."""
+"""Largest duration of a run, as a multiple of the path's duration, to which 10 s are added [1]."""
 
 
 class ControlLoopState(eqx.Module, Generic[State]):
@@ -34,7 +34,7 @@ class ControlLoopState(eqx.Module, Generic[State]):
     Attributes:
         estimator: state of the estimator.
         controller: state of the controller.
-        time: time of the path, which runs slower than real time while the robot lags [s].
+        time: time of the path [s]; it runs slower than real time while the robot lags.
     """
 
     estimator: State
@@ -49,7 +49,7 @@ class ControlLoopOutput(eqx.Module):
         command: wheel speeds [rad/s].
         estimate: output of the estimator.
         time: time of the path [s].
-        gave_up: whether the robot was stuck and has stopped for good.
+        gave_up: True if the robot was stuck and has stopped for good.
     """
 
     command: Float[Array, " wheel"]
@@ -76,9 +76,10 @@ class ControlLoop(eqx.Module, Generic[State]):
         measurement: Measurement | Readings,
         dt: Float[Numbers, ""] | float,
     ) -> tuple[ControlLoopState[State], ControlLoopOutput]:
-        """Return the next state, and the output: the command and the estimate behind it."""
+        """Return the next state, and the output: command, estimate and time of the path."""
         dt = jnp.asarray(dt, dtype=float)
         estimator, estimate = self.estimator.step(state.estimator, measurement, dt)
+        # an invalid pose counts as far from the path, which then waits
         here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
         time, reference = path.follow(state.time, here, dt, self.controller.gains.preview)
         controller, command = self.controller.step(state.controller, reference, estimate, dt)
@@ -88,7 +89,7 @@ class ControlLoop(eqx.Module, Generic[State]):
 
 @runtime_checkable
 class Plant(Protocol):
-    """A real or simulated robot: it receives wheel speeds and returns readings of sensors."""
+    """A real or simulated robot, which receives wheel speeds and returns sensor readings."""
 
     def reset(self) -> Measurement | Readings:
         """Return the first readings, of the robot at rest."""
@@ -100,7 +101,7 @@ class Plant(Protocol):
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """True x, y [m] and heading [rad], which are used for metrics only, not by controllers."""
+        """True x, y [m] and heading [rad]; they are used only for metrics, not by controllers."""
         ...
 
 
@@ -133,13 +134,15 @@ class ClosedLoopRun:
 
 
 _step = eqx.filter_jit(ControlLoop.step)
-"""Compiled step with all numbers as arguments, so that loops of equal structure share the code."""
+"""Compiled step that takes all numbers as arguments; loops of equal structure share its code."""
 
 
 def run_closed_loop(
     loop: ControlLoop[State], path: Path, plant: Plant, start: Pose
 ) -> ClosedLoopRun:
-    """Run a control loop on a plant at rest until its path is over or the controller gives up.
+    """Run a control loop on a plant until the path ends, the controller gives up or time is over.
+
+    The plant is reset first and so starts at rest. For the time limit see `DURATION_FACTOR`.
 
     Args:
         loop: estimator and controller.
@@ -190,18 +193,18 @@ class PathMetrics:
     """Errors of a closed-loop run along its path, computed from true poses.
 
     Attributes:
-        along_track_mm: error along the direction of travel at the end of every side or quarter of a
-            curve, positive if the robot went too far [mm].
-        sides_mm: straight distance in the path from each of these ends to the next [mm].
+        along_track_mm: error along the direction of travel at the end of every side of a polygon or
+            quarter of a curve, positive if the robot went too far [mm].
+        sides_mm: straight length of each side, or distance between the ends of each quarter [mm].
         closure_mm: distance from the last pose to the end of the path, plus the path length that
             remained if the controller gave up [mm].
         cross_track_rmse_mm: root mean square over time of the distance from the path [mm].
         heading_error_deg: heading error at the end [deg].
-        path_length_mm: length of the path driven, the 2021 paper's metric [mm].
+        path_length_mm: length of the path that the robot drove, the 2021 paper's metric [mm].
         energy_j: energy used by the motors [J]; None if the plant does not provide it.
         effort: root mean square change of the commanded wheel speeds per period [rad/s].
         seconds: duration of the run [s].
-        finished: whether the end of the path was reached.
+        finished: True if the path ran to its end within the run.
     """
 
     along_track_mm: tuple[float, ...]

@@ -1,20 +1,21 @@
 """Controllers compute wheel speed commands from a reference pose and an estimate.
 
-All have the same interface, `init() -> state` and `step(state, reference, estimate, dt) -> (state,
-wheel speeds)`, the same limiter, which keeps the direction of motion, and the same safe stop. They
-differ in the terms that they add to the pose loop
+All controllers have the same interface, `init() -> state` and `step(state, reference, estimate, dt)
+-> (state, wheel speeds)`, the same limiter, which keeps the direction of motion, and the same safe
+stop. They differ in the terms that they add to the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 
-or in a control law that replaces it. Here the pose is p [m] and heading [rad], their references are
-p_ref and heading_ref, v [m/s] is the demanded velocity in the body frame, W [rad/s] the demanded
-yaw rate, and R(-heading) rotates from world to body axes.
+or in a control law that replaces the pose loop. Here p [m] and heading [rad] are the estimated
+pose, p_ref and heading_ref the reference pose, v_ref [m/s] and W_ref [rad/s] its rates, v [m/s] is
+the demanded velocity in the body frame, W [rad/s] the demanded yaw rate, k and k_yaw [1/s] are
+gains, and R(-heading) rotates from world to body axes.
 
 A robot whose wheels turn while its body stands still enters recovery: it alternates between turning
-on the spot and driving, with growing effort. A robot far from its path can get stuck in this way if
-the demands to drive and to turn cancel at the wheels with traction, so that only a wheel without
-traction spins. The controller returns to normal operation once the robot has moved for a while.
-Otherwise it stops for good and reports that it gave up.
+on the spot and driving, with growing effort. This helps a robot that is far from its path and stuck
+because the demands to drive and to turn cancel at the wheels with traction, so that only a wheel
+without traction spins. The controller returns to normal operation once the robot has moved for a
+while. Otherwise it stops for good and reports that it gave up.
 """
 
 from collections.abc import Callable
@@ -41,11 +42,11 @@ OBSERVER_S = 0.4
 LARGEST_INTEGRAL = 0.06
 """Largest velocity that the integral term may add to each component [m/s]."""
 STUCK_S = 0.5
-"""A robot counts as stuck after this time without the demanded motion, and as free again after this
-time with it [s]."""
+"""Time without the demanded motion after which a robot counts as stuck, and time with the demanded
+motion after which it counts as free again [s]."""
 STUCK_SHARE, STUCK_LEAST_SPEED = 0.2, 0.1
-"""A robot counts as blocked if its speed is below `STUCK_SHARE` times the demanded speed [1], and
-the demanded speed exceeds `STUCK_LEAST_SPEED` [m/s]."""
+"""A robot counts as blocked if the demanded speed exceeds `STUCK_LEAST_SPEED` [m/s] and the
+estimated speed is below the fraction `STUCK_SHARE` [1] of the demanded speed."""
 RECOVERY_TURN_S, RECOVERY_DRIVE_S = 0.6, 1.2
 """Durations of the alternating phases of a recovery: turning on the spot, then driving [s]."""
 RECOVERY_GROWTH = 0.6
@@ -64,7 +65,7 @@ class Gains(eqx.Module):
     preview: Array = parameter(
         "s",
         "t_p",
-        "time by which reference rates are taken ahead, to compensate the delay of the wheels",
+        "time by which reference rates are read ahead on the path, to compensate the wheels' delay",
         start=0.2,
     )
 
@@ -72,11 +73,11 @@ class Gains(eqx.Module):
     def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
         """Return the gains tuned for a robot and its load set-up if they beat those set by hand.
 
-        With `forced`, tuned gains are returned even if they are no better. In all other cases, and
-        without tuned gains for this load set-up, the gains set by hand are returned.
+        With `forced`, tuned gains are returned even if they are no better. Otherwise, and also if
+        the record has no tuned gains for this load set-up, the gains set by hand are returned.
 
         Raises:
-            ValueError: the robot has no record.
+            ValueError: the robot consists of arrays without a record.
         """
         known = with_record(robot)
         tuned = known.record.gains
@@ -94,7 +95,7 @@ class Limits(eqx.Module):
         wheel_speed: largest speed of a wheel [rad/s].
         acceleration: largest acceleration of a wheel [rad/s^2].
         voltage: voltage of the supply [V].
-        twist: largest translational speed demanded of the body [m/s].
+        twist: largest translational speed that is demanded of the body [m/s].
     """
 
     wheel_speed: Scalar = 13.0
@@ -108,13 +109,13 @@ class ControllerState(eqx.Module):
 
     Attributes:
         command: last command [rad/s].
-        integral: velocity of the integral term [m/s].
+        integral: velocity that the integral term adds [m/s].
         wanted: twist that was demanded in the last step [m/s, m/s, rad/s].
         miss: smoothed difference, estimated twist less demanded twist [m/s, m/s, rad/s].
         still: time for which the body has not moved as demanded; it counts down while the body
             moves as demanded [s].
-        tried: time since the current recovery began, 0 if there is none [s].
-        begun: whether a command has been computed yet.
+        tried: time since the present recovery began; 0 if the robot is not in recovery [s].
+        begun: True if a command has been computed already.
     """
 
     command: Float[Array, " wheel"]
@@ -127,7 +128,7 @@ class ControllerState(eqx.Module):
 
     @property
     def gave_up(self) -> Bool[Array, ""]:
-        """Whether the controller has stopped for good because the robot is stuck."""
+        """True if the controller has stopped for good because the robot is stuck."""
         return self.tried > RECOVERY_LIMIT_S
 
 
@@ -141,16 +142,16 @@ def limit_command(
 ) -> Float[Array, " wheel"]:
     """Return wheel speeds within all limits, scaled together so that the robot keeps its direction.
 
-    The limits of wheel speed and voltage scale the whole command. The voltage at each motor,
-    U = R |I| + n C_e |w|, must not exceed that of the supply; R is the resistance [Ohm], I the
-    current [A], n the gear ratio, C_e the back-EMF constant [V s/rad] and w the wheel speed
-    [rad/s]. The limit of acceleration scales the change from the last command. The result is never
-    NaN.
+    If a wheel exceeds the limits of speed or voltage, the whole command is scaled down. The voltage
+    at each motor, U = R |I| + n C_e |w|, must not exceed the supply voltage; R is the resistance
+    [Ohm], I the current [A], n the gear ratio, C_e the back-EMF constant [V s/rad] and w the wheel
+    speed [rad/s]. If a wheel exceeds the limit of acceleration, the whole change from the last
+    command is scaled down. The result is never NaN.
 
     Args:
         wanted: demanded wheel speeds [rad/s].
         before: last command [rad/s].
-        current: motor currents, whose voltage drop reduces the largest wheel speed [A].
+        current: motor currents [A]; their voltage drop reduces the largest wheel speed.
         robot: robot with the constants of its motor.
         limits: limits of the command.
         dt: time since the last command [s].
@@ -172,12 +173,12 @@ def limit_command(
 
 
 def _spins(tried: Float[Array, ""]) -> Bool[Array, ""]:
-    """Return whether a robot turns on the spot after `tried` seconds of recovery."""
+    """Return whether recovery is in its phase of turning on the spot after `tried` seconds."""
     return (tried > 0) & (jnp.mod(tried, RECOVERY_TURN_S + RECOVERY_DRIVE_S) < RECOVERY_TURN_S)
 
 
 def _recovery_factors(tried: Float[Array, ""]) -> Float[Array, "3"]:
-    """Return the factors on the demanded twist after `tried` seconds of recovery."""
+    """Return factors for the three components of the demanded twist after `tried` s of recovery."""
     one = jnp.where(_spins(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
     return jnp.where(tried > 0, one * (1 + RECOVERY_GROWTH * tried), 1.0)
 
@@ -191,10 +192,10 @@ class Controller(eqx.Module):
             hand.
         limits: limits of the command.
         correction: torque correction of the 2021 paper: "paper_print" as printed in the paper,
-            "paper_code" as in the authors' program, "torque" with their errors corrected, or
+            "paper_code" as in the authors' program, "torque" with the errors of both corrected, or
             "none".
-        law: control law that replaces the pose loop and its integral; if it is an equinox module,
-            its numbers are arguments of the compiled code.
+        law: control law that replaces the pose loop and its integral term; if it is an equinox
+            module, its parameters are arguments of the compiled code.
     """
 
     robot: RobotArrays
@@ -217,7 +218,7 @@ class Controller(eqx.Module):
 
     @eqx.filter_jit
     def init(self) -> ControllerState:
-        """Return the state of a controller before its first command."""
+        """Return the controller's state before its first command."""
         none, still, zero = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros(())
         return ControllerState(none, jnp.zeros(2), still, still, zero, zero, jnp.zeros((), bool))
 
@@ -230,9 +231,9 @@ class Controller(eqx.Module):
     ) -> tuple[ControllerState, Float[Array, " wheel"]]:
         """Return the next state and the wheel speeds to command [rad/s].
 
-        The robot stops, at the allowed deceleration, while the estimate is stale or any input is
-        not finite, and for good once the controller has given up. The first command is limited
-        relative to the measured wheel speeds.
+        While the estimate is stale or any input is not finite, the robot stops at the allowed
+        deceleration; once the controller has given up, it stops for good. The acceleration limit of
+        the first command is relative to the measured wheel speeds.
 
         Args:
             state: state from `init` or the last step.
@@ -250,7 +251,7 @@ class Controller(eqx.Module):
         safe &= ~old.gave_up
         still, tried = self._recovery(old, e, jnp.where(safe, dt, 0.0))
         wanted = self._demanded_twist(old, ref, pose, gap)
-        # The disturbance is the estimated twist less the twist demanded in the last step.
+        # low-pass filter the disturbance: the estimated twist less the last step's demanded twist
         twist = jnp.where(safe, e.twist, 0.0)
         a = 1 - jnp.exp(-dt / OBSERVER_S)
         miss = old.miss + a * (twist - old.wanted - old.miss)
@@ -260,9 +261,8 @@ class Controller(eqx.Module):
         wheels = jnp.where(safe, wheels, 0.0)
         since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
         command = limit_command(wheels, before, e.current, self.robot, self.limits, since)
-        free = safe & (
-            jnp.max(jnp.abs(command - wheels)) < 0.05
-        )  # The integral is frozen while a limit is active.
+        # freeze the integral while a limit is active, so that it does not wind up
+        free = safe & (jnp.max(jnp.abs(command - wheels)) < 0.05)
         summed = jnp.clip(old.integral + k.integral * gap * dt, -LARGEST_INTEGRAL, LARGEST_INTEGRAL)
         new = ControllerState(
             command=command,
@@ -276,10 +276,10 @@ class Controller(eqx.Module):
         return new, command
 
     def _recovery(self, old: ControllerState, e: StateEstimate, dt: Array) -> tuple[Array, Array]:
-        """Return the time without the demanded motion, and the time since recovery began [s].
+        """Return the new `still` and `tried` of `ControllerState` [s].
 
-        While the robot turns on the spot no translation is demanded, so the first time does not
-        change during that phase.
+        While the robot turns on the spot no translation is demanded, so `still` does not change
+        during that phase.
         """
         demand = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
         speed = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
@@ -291,9 +291,9 @@ class Controller(eqx.Module):
         return still, jnp.where(tries, old.tried + dt, 0.0)
 
     def _demanded_twist(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
-        """Return the twist that the pose loop or the law demands, within the speed limit.
+        """Return the twist [m/s, m/s, rad/s] that the pose loop or the control law demands.
 
-        Units are [m/s, m/s, rad/s].
+        In recovery it is multiplied by `_recovery_factors`; then it is scaled to the speed limit.
         """
         wanted = self._pose_loop(old, ref, pose, gap) if self.law is None else self.law(ref, pose)
         wanted = wanted * _recovery_factors(old.tried)
@@ -308,7 +308,10 @@ class Controller(eqx.Module):
         return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
 
     def _torque(self, wanted: Array, e: StateEstimate) -> Array:
-        """Return the 2021 paper's correction for forces across the commanded direction [rad/s]."""
+        """Return the 2021 paper's correction of wheel speeds for forces across the motion [rad/s].
+
+        It is 0 with the correction "none".
+        """
         if self.correction == "none":
             return jnp.zeros(self.robot.wheels)
         f = self.robot
@@ -326,7 +329,8 @@ class Controller(eqx.Module):
             off = force.at[:2].add(-(force[:2] @ u) * u).at[2].multiply(straight)
         if self.correction == "torque":
             moment = f.frame.radius * f.inverse.T @ off
-        else:  # as printed in the paper: divided by the lever arm instead of multiplied
+        else:
+            # both variants of the paper divide by the lever arm instead of multiplying by it
             printed = f.forward.at[:, 2].divide(f.frame.base**2)
             moment = f.frame.radius * printed @ off
         moves = jnp.max(jnp.abs(e.wheel_speed)) > 0.5

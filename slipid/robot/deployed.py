@@ -27,30 +27,31 @@ class RobotArrays(Drives):
     """Arrays of an identified robot with one load set-up, for estimators and controllers.
 
     Compiled code depends only on the static fields, which describe the robot's structure, so robots
-    of equal structure share it, with any parameters. A drive is a motor with its encoder and
-    ammeter. There is one for every wheel unless a motor drives several wheels.
+    of equal structure share the code, whatever their parameters are. A drive is a motor with its
+    encoder and ammeter. Every wheel has its own drive unless a motor drives several wheels.
 
     Attributes:
         frame: directions and radii of the wheels.
         places: wheel centres in the body frame [m].
-        forward: matrix J (drive, 3), rim speeds [m/s] = J body twist [m/s, m/s, rad/s].
+        forward: matrix J (drive, 3) from body twist [m/s, m/s, rad/s] to rim speeds [m/s].
         inverse: pseudo-inverse of J (3, drive).
         motor: constants of the motor, which all drives share.
         floors: contact parameters, one row per floor in the order of `labels`.
         rest: fraction of the weight on each wheel at rest [1].
         mass: mass of the robot [kg].
-        process: std of the model's random errors, which grow with the root of the path length,
-            along and across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
-        effect: std of the effects, errors that stay the same over the path, along and across [m/m]
-            and in yaw [rad/m]; it includes the posterior spread of the fitted parameters.
+        process: std of the model's random errors along and across [m/sqrt(m)] and in yaw
+            [rad/sqrt(m)]; these errors grow with the root of the path length.
+        effect: std of the effects (model errors that stay the same over the path) along and across
+            [m/m] and in yaw [rad/m]; it includes the posterior spread of the fitted parameters.
         effect_table: estimates of the effects from the fitted runs, by direction and speed.
-        friction_covariance: posterior covariance of the log frictions.
+        friction_covariance: posterior covariance of the floors' log friction coefficients.
         current_std: std of measured less modelled currents, without the ammeters' noise [A].
-        current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v
-            [A, A s/m].
+        current_trend: a [A] and b [A s/m] of the excess a + b v of measured over modelled currents
+            at a body speed v [m/s].
         highest: highest wheel speed of the fitted runs [rad/s], and the largest current that the
-            model predicts up to 0.8 of that speed [A].
-        wheel_curve: a and b of a + b |I|, the slip ratio of each drive over all floors (drive, 2).
+            model predicts at up to 0.8 of that speed [A].
+        wheel_curve: a [1] and b [1/A] of the slip ratio a + b |I| of each drive at a current I [A],
+            fitted over all floors.
         drive_of: drive of each wheel, see `slipid.model.geometry.Drives`.
         around: order of the wheels around the body, see `slipid.model.geometry.Geometry`.
         unseen: for each floor, True if no run drove on it.
@@ -87,13 +88,13 @@ class RobotArrays(Drives):
 
     @property
     def by_wheels(self) -> Float[Array, "3 wheel"]:
-        """Matrix from rim speeds of wheels to body twist, for equal speeds of wheels of a drive."""
+        """Matrix from the wheels' rim speeds to body twist; wheels of one drive are averaged."""
         if not self.drive_of:
             return self.inverse
         return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
 
     def standing(self, under: Int[Array, " wheel"]) -> Standing:
-        """Return the robot on given floors; `under` is the index of the floor under each wheel."""
+        """Return the robot standing on floors with the indices `under`, one for each wheel."""
         return Standing(self.frame, self.floors.at(under), self.rest, self.motor, self.mass)
 
     @property
@@ -106,7 +107,7 @@ class DeployedRobot(RobotArrays):
     """An identified robot ready for deployment: the content of robot.json for one load set-up.
 
     Attributes:
-        record: every parameter with its interval, verdict and provenance.
+        record: content of robot.json, every parameter with its interval, verdict and provenance.
         load_setup: name of the load set-up.
     """
 
@@ -115,17 +116,17 @@ class DeployedRobot(RobotArrays):
 
     @property
     def steers(self) -> bool:
-        """Whether its wheels can produce any twist, each of them driven alone.
+        """True if the wheels can produce every body twist and each wheel has its own motor.
 
-        Other robots have an estimator but no controller, since `slipid.robot.controller` also
-        demands sideways motion.
+        Only such a robot has a controller, since `slipid.robot.controller` demands sideways motion
+        too; all other robots have only an estimator.
         """
         shape = geometry_of(self.record)
         return not shape.drive_of and shape.determines_twist
 
     @classmethod
     def of(cls, record: RobotRecord, load: str | None = None) -> "DeployedRobot":
-        """Return the robot of a record with a load set-up, the first one by default.
+        """Return the robot that a record describes, with the named or else its first load set-up.
 
         Raises:
             ValueError: there is no such load set-up, or a parameter is missing or out of bounds.
@@ -135,13 +136,13 @@ class DeployedRobot(RobotArrays):
 
     @classmethod
     def load(cls, path: Path | str, load: str | None = None) -> "DeployedRobot":
-        """Return the robot of a file that `slipid identify`, `slipid sample` or `save` wrote.
+        """Return the robot in a file that `slipid identify`, `slipid sample` or `save` wrote.
 
         `load` is the name of the load set-up, by default the first one in the file.
 
         Raises:
-            DataError: the file is absent, damaged, changed or of a newer version, or has no such
-                load set-up.
+            DataError: the file is absent, damaged, changed by hand or of another schema version, or
+                has no such load set-up.
         """
         record = read_robot(Path(path))
         try:
@@ -157,15 +158,16 @@ class DeployedRobot(RobotArrays):
         """Write robot.json, with all load set-ups.
 
         Raises:
-            ValueError: the arrays differ from those of the record because they were changed; only
-                the record can be stored in a file.
+            ValueError: the arrays were changed and so differ from the record; only the record can
+                be stored in a file.
             DataError: the file cannot be written.
         """
         same = DeployedRobot.of(self.record, self.load_setup)
         pairs = zip(jax.tree.leaves(self), jax.tree.leaves(same), strict=True)
         if not all(np.array_equal(a, b) for a, b in pairs):
             raise ValueError(
-                "the arrays of this robot differ from its record and cannot be stored in a file"
+                "the arrays of this robot were changed and differ from its record, but only the "
+                "record can be stored in a file; expected an unchanged robot"
             )
         write_robot(Path(path), self.record)
 
@@ -173,38 +175,40 @@ class DeployedRobot(RobotArrays):
         """Return the robot for a site on which only these floors occur.
 
         Raises:
-            ValueError: no floor is given, one is given twice or is not identified; the message
-                lists the identified floors.
+            ValueError: no floor is given, or a floor is given twice or is not identified; the
+                message lists the identified floors.
         """
         known = ", ".join(self.labels)
         for name in floors:
             if name not in self.labels:
                 raise ValueError(f"no floor '{name}'; identified: {known}")
         if len(set(floors)) < max(len(floors), 1):
-            raise ValueError(f"floors {list(floors)}; expected different names out of {known}")
+            raise ValueError(
+                f"floors {list(floors)}; expected one or more of {known}, each at most once"
+            )
         rows = tuple(self.labels.index(name) for name in floors)
         return DeployedRobot.of(self.record.on(rows), self.load_setup)
 
     def with_unseen(self) -> "DeployedRobot":
         """Return the robot with additional floors `unseen_1`, `unseen_2`, ... that no run drove on.
 
-        On an unfamiliar floor its estimator then selects the one of them that fits the currents
-        best, with a large uncertainty of the motion; without them it selects a known floor. See
-        `slipid.robot.unseen`.
+        On an unfamiliar floor the robot's estimator then selects the additional floor that explains
+        the currents best, with a large uncertainty of the motion. Without additional floors it
+        would select an identified floor. See `slipid.robot.unseen`.
         """
         return DeployedRobot.of(with_unseen(self.record), self.load_setup)
 
 
 def with_record(robot: RobotArrays) -> DeployedRobot:
-    """Return the same robot, checked to include its record.
+    """Return the same robot, typed as `DeployedRobot`, if it includes its record.
 
     Raises:
-        ValueError: the robot consists of arrays alone.
+        ValueError: the robot consists only of arrays.
     """
     if not isinstance(robot, DeployedRobot):
         raise ValueError(
-            "the arrays of a robot without its record; expected a DeployedRobot, or settings and "
-            "gains in addition to the arrays"
+            "this robot has arrays but no record; expected a DeployedRobot, or explicit settings "
+            "and gains for the estimator and controller"
         )
     return robot
 
@@ -212,9 +216,9 @@ def with_record(robot: RobotArrays) -> DeployedRobot:
 def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
     """Return the robots of the posterior draws with indices `picked`, stacked along a leading axis.
 
-    `DeployedRobot.effect` then holds only the differences between runs, since the draws themselves
-    show the spread of the parameters. The effect tables (mean, remaining fraction of the std),
-    `highest` and `wheel_curve` are those of `robot`.
+    The stacked `effect` is the std of effects without the posterior spread of the parameters, since
+    the draws themselves show that spread. `effect_table`, `highest` and `wheel_curve` are the same
+    for all draws.
     """
     record, one = robot.record, []
     plain = {path: n.value for path, n in record.parameters.items()}
@@ -227,9 +231,10 @@ def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedR
 def _arrays(
     record: RobotRecord, load: str | None, values: Mapping[str, Numbers], spread: bool = True
 ) -> DeployedRobot:
-    """Return the arrays of a record, with `values` of its parameters, keyed by path.
+    """Return the robot of a record and a load set-up with the parameters `values`, keyed by path.
 
-    With `spread` the std of effects includes the posterior uncertainty of the parameters.
+    With `spread`, the std of effects and the covariance of frictions include the posterior
+    uncertainty of the parameters.
     """
     place = record.load_index(load)
     chosen, wheels, floors = record.loads[place], record.wheels, record.floors
@@ -273,9 +278,9 @@ def _arrays(
 
 
 def _effect_table(load: LoadRecord, whole: Float[np.ndarray, "floor 3"]) -> EffectLookup:
-    """Return the effect table of a load set-up, with remaining stds divided by `whole`.
+    """Return the effect table of a load set-up, with remaining stds as fractions of `whole`.
 
-    `whole` (floor, 3) is the std of each floor's effects without a table [m/m, m/m, rad/m].
+    `whole` (floor, 3) is the std that each floor's effects have without a table [m/m, m/m, rad/m].
     """
     if load.told is None:
         return EffectLookup.empty(len(whole))
@@ -286,7 +291,7 @@ def _effect_table(load: LoadRecord, whole: Float[np.ndarray, "floor 3"]) -> Effe
 
 
 def _friction_covariance(record: RobotRecord) -> Float[np.ndarray, "floor floor"]:
-    """Return the posterior covariance of the floors' log frictions; fixed frictions have 0."""
+    """Return the posterior covariance of the floors' log frictions; it is 0 for fixed frictions."""
     still = (1.0,) * max(record.drawn, 1)
     paths = [f"surface.{name}.friction" for name in record.labels]
     logs = np.log(np.array([record.draws.get(path, still) for path in paths], dtype=float))

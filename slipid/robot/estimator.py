@@ -6,7 +6,7 @@ into a body motion, from which a second filter computes the pose (`pose_filter`)
     xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late corrections from the floors)
 
 with p_c the probability of hypothesis c (a floor for each wheel), and xi_c the body twist [m/s,
-m/s, rad/s] if that hypothesis is true.
+m/s, rad/s] if hypothesis c is true.
 """
 
 from dataclasses import replace
@@ -34,7 +34,7 @@ from slipid.robot.interface import (
 )
 
 SLIP_CURRENT = 0.4
-"""Motor current above which the 2021 paper's deployed estimator subtracts slip [A]."""
+"""Motor current above which the estimator on the 2021 paper's robot subtracts slip [A]."""
 
 
 class EstimatorState(eqx.Module):
@@ -43,7 +43,7 @@ class EstimatorState(eqx.Module):
     Attributes:
         wheels: angles, speeds and ages of the wheels' readings.
         current: filtered currents of the motors [A].
-        floors: belief about the floors.
+        floors: belief about the floors under the wheels.
         place: pose with its covariance.
         stuck: time since the body stopped moving while its wheels turn [s].
     """
@@ -56,14 +56,15 @@ class EstimatorState(eqx.Module):
 
 
 class Estimator(AbstractEstimator[EstimatorState]):
-    """Filter over the floors under the wheels, with pose and covariance.
+    """Estimator of the floors under the wheels, and of the pose with its covariance.
 
     Attributes:
         robot: identified robot; its `labels` name the floors in the order of
             `StateEstimate.surface_probability`.
-        settings: settings; by default those for the sensors and floors of the robot's logs.
-        floor: map of the site, its surfaces numbered as in the robot's `labels`; None without a
-            map.
+        settings: settings; by default `Settings.of(robot)`, for the sensors and floors of the
+            robot's logs.
+        floor: map of the site, whose surfaces are numbered as in the robot's `labels`; None without
+            a map.
     """
 
     robot: RobotArrays
@@ -96,7 +97,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
     def advance(
         self, state: EstimatorState, z: Readings, dt: Float[Array, ""]
     ) -> tuple[EstimatorState, StateEstimate]:
-        """Return state and estimate one time step later; see `AbstractEstimator.step`."""
+        """Return state and estimate one time step `dt` later; see `AbstractEstimator.step`."""
         f, s, old = self.robot, self.settings, state
         dt = time_step(dt, s)
         wheels = read_wheels(f, s, old.wheels, z, dt)
@@ -149,8 +150,8 @@ class Estimator(AbstractEstimator[EstimatorState]):
     def _stuck(self, before: Array, w: Array, twist: Array, tick: TimeStep) -> Array:
         """Return the time since the body stopped moving while its wheels turn [s].
 
-        The body counts as stopped below a fifth of the speed of wheels that do not slip. Source:
-        Ward and Iagnemma 2008.
+        The body counts as stopped if it is slower than a fifth of the speed that it would have if
+        no wheel slipped. Source: Ward and Iagnemma 2008.
         """
         f = self.robot
         speed = length((f.inverse @ (f.frame.radius * w))[:2])
@@ -158,7 +159,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         return jnp.where(blocked, jnp.minimum(before + tick.dt, 1e3), 0.0)
 
     def _beyond(self, w: Array, amps: Array, unknown: Array) -> Bool[Array, ""]:
-        """Return whether speed or currents exceed those of the fitted runs, or no floor fits."""
+        """Return whether speed or currents far exceed the fitted runs, or the floor is unknown."""
         highest = self.robot.highest
         fast = jnp.max(jnp.abs(w)) > 1.3 * highest[0]
         return fast | (jnp.max(jnp.abs(amps)) > 1.3 * highest[1]) | (unknown > 0.5)
@@ -169,9 +170,10 @@ def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Arra
 
     Args:
         floors: belief before the correction.
-        left: factor on the distances between the hypotheses' poses, in world axes (3, 3).
+        left: matrix (3, 3) by which distances of the hypotheses' poses from the estimated pose are
+            multiplied, in world axes.
         place: corrected pose.
-        expected: probability of each hypothesis by the map at the corrected pose.
+        expected: probability that the map gives each hypothesis at the corrected pose.
     """
     world = axes_rotation(place.pose[2])
     return replace(floors, apart=floors.apart @ (world.T @ left @ world).T, expected=expected)
@@ -196,8 +198,9 @@ class Odometry(AbstractEstimator[OdometryState]):
 
     Attributes:
         robot: identified robot.
-        settings: settings; by default those for the sensors and floors of the robot's logs.
-        curve: True for a slip ratio by `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
+        settings: settings; by default `Settings.of(robot)`, for the sensors and floors of the
+            robot's logs.
+        curve: True for the slip ratio a + b |I| of `RobotArrays.wheel_curve` while the smoothed
             current I [A] exceeds `SLIP_CURRENT`, as on the 2021 paper's robot; False for no slip.
     """
 
@@ -224,15 +227,14 @@ class Odometry(AbstractEstimator[OdometryState]):
     def advance(
         self, state: OdometryState, z: Readings, dt: Float[Array, ""]
     ) -> tuple[OdometryState, StateEstimate]:
-        """Return state and estimate one time step later; neither gyro nor pose fixes are used."""
+        """Return state and estimate one time step `dt` later; gyro and pose fixes are not used."""
         f, s, old = self.robot, self.settings, state
         dt = time_step(dt, s)
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
         known = jnp.isfinite(z.current) & (jnp.abs(z.current) < 10.0 * f.highest[1])
-        a = 1 - jnp.exp(
-            -dt / 0.6
-        )  # 0.6 s, since the filter of the paper's robot had a factor of 0.97 per row
+        # the current filter of the 2021 paper's robot kept 0.97 per row: a time constant of 0.6 s
+        a = 1 - jnp.exp(-dt / 0.6)
         smoothed = old.current + a * (jnp.abs(z.current) - old.current)
         amps = jnp.where(known, smoothed, old.current)
         slip = jnp.zeros_like(w)

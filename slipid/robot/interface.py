@@ -21,10 +21,10 @@ NO_FLOOR = "unknown"
 """Name used for the floor under a wheel if no identified floor explains the measurements."""
 MIXED_FLOORS_PENALTY = 1.0
 """Value of `Settings.further_floor_penalty` for a robot that is known to drive across edges between
-floors: decrease of the log probability for each further floor [1]."""
+floors [1]; it is below the default, since several floors under such a robot are more likely."""
 UNTIMED_S = 0.01
-"""Duration that is assumed for a step without a valid time step, for the age of readings and for
-stopping [s]."""
+"""Duration that is assumed for a step whose `dt` is invalid, so that readings still age and a stop
+still makes progress [s]."""
 State = TypeVar("State", bound=eqx.Module)
 Some = TypeVar("Some", bound=eqx.Module)
 Scalar = Float[Array, ""] | float
@@ -36,26 +36,27 @@ def as_arrays(given: Some) -> Some:
 
 
 class Settings(eqx.Module):
-    """Settings of an estimator, which are chosen and not identified.
+    """Settings of an estimator; they are chosen instead of identified.
 
     Attributes:
-        current_is_signed: whether the ammeters measure the sign of a current.
-        forget_s: measurements within this time count as one independent piece of evidence about the
-            floors [s].
-        filter_s: time constant of the filter of currents [s].
+        current_is_signed: True if the ammeters measure the sign of a current.
+        forget_s: time within which all measurements count as one independent piece of evidence
+            about the floors [s].
+        filter_s: time constant of the low-pass filter of currents [s].
         patch_m: mean path length between changes of the floor under a wheel [m].
-        doubt_m: distance over which an error of the belief about floors persists [m].
+        doubt_m: path length over which an error of the belief about floors decays by a factor of e
+            [m].
         further_floor_penalty: decrease of the log probability of a hypothesis for each further
             floor under the robot [1].
         unknown_std: weighted residual above which "unknown" is more likely than a hypothesis [1].
-        ammeter_std_a: noise of an ammeter [A].
-        voltmeter_std_v: noise of a voltmeter [V].
-        gyro_std: noise of a gyro's reading [rad/s].
+        ammeter_std_a: std of an ammeter's noise [A].
+        voltmeter_std_v: std of a voltmeter's noise [V].
+        gyro_std: std of a gyro's noise [rad/s].
         gyro_bias_std: std of a gyro's bias at the start [rad/s].
-        gyro_delay_s: age of a gyro's readings [s].
+        gyro_delay_s: age of a gyro's readings when they arrive [s].
         still_m_s: rim speed below which the robot counts as at rest [m/s].
-        stale_s: a wheel is stale after this time without readings [s].
-        longest_s: longest time step for which motion is predicted [s].
+        stale_s: time without readings after which a wheel counts as stale [s].
+        longest_s: longest time step; a longer `dt` is limited to it [s].
     """
 
     current_is_signed: bool = eqx.field(static=True, default=False)
@@ -79,7 +80,7 @@ class Settings(eqx.Module):
         """Return the settings for a robot with the sensors and floors of its logs.
 
         Raises:
-            ValueError: the robot comes without its record.
+            ValueError: the robot consists of arrays without a record.
         """
         record = with_record(robot).record
         return cls(
@@ -90,7 +91,8 @@ class Settings(eqx.Module):
 class Readings(eqx.Module):
     """A measurement with NaN for all absent readings; attributes as in `Measurement`.
 
-    Robots with the same number of drives have the same structure, regardless of their sensors.
+    Readings have the same structure for all robots with the same number of drives, whatever sensors
+    a robot has, so that compiled code is shared.
     """
 
     wheel_angle: Float[Array, "*batch drive"]
@@ -105,31 +107,31 @@ class Readings(eqx.Module):
     @classmethod
     @eqx.filter_jit
     def nothing(cls, drives: int) -> "Readings":
-        """Return the readings of a robot with this number of drives and no sensors."""
+        """Return the readings of a robot with `drives` drives and no sensors: NaN everywhere."""
         shapes = [(drives,)] * 4 + [(), (3,), (2,), ()]
         return cls(*(jnp.full(shape, jnp.nan, dtype=float) for shape in shapes))
 
     def filled(self, drives: int) -> "Readings":
-        """Return these readings, in which no field is missing."""
+        """Return the readings unchanged, since none of their fields is None."""
         return self
 
 
 class Measurement(eqx.Module):
     """Readings of the sensors in one step; None or NaN if there is no reading.
 
-    Example: `Measurement(wheel_angle=angle, current=amps)` for a robot that measures these two.
+    Example: `Measurement(wheel_angle=angle, current=amps)` for a robot with encoders and ammeters.
 
     Attributes:
         wheel_angle: cumulative angle of every encoder, scaled to turns of the wheel [rad]; it takes
             precedence over `wheel_speed`.
-        wheel_speed: rate of change of that angle [rad/s].
+        wheel_speed: rate of change of the wheel angle [rad/s].
         current: current of every motor [A], with or without sign according to the settings.
         voltage: voltage of every motor [V].
         gyro: yaw rate [rad/s].
         fix: pose from another source such as a camera: x, y [m], heading [rad].
         fix_std: std of the fix's position [m] and heading [rad]; a fix without it is ignored.
-        fix_age: age of the fix [s]; an unknown age counts as 0, and a fix from before the 47 last
-            steps, of which the estimator keeps a history, is ignored.
+        fix_age: age of the fix [s]; an unknown age counts as 0. A fix older than the estimator's
+            history of poses, which goes back 47 steps, is ignored.
     """
 
     wheel_angle: Given = None
@@ -153,7 +155,7 @@ class Measurement(eqx.Module):
                 array, shape = jnp.asarray(value, dtype=float), given[name].shape
                 if array.shape != shape:
                     of = f"a robot with {drives} encoders"
-                    raise ValueError(f"{name} of shape {array.shape}; expected {shape} of {of}")
+                    raise ValueError(f"{name} of shape {array.shape}; expected {shape} for {of}")
                 given = given | {name: array}
         return Readings(**given)
 
@@ -168,11 +170,11 @@ class StateEstimate(eqx.Module):
         wheel_speed: speed of the wheels of each drive [rad/s].
         current: signed, filtered current of each motor [A].
         surface_probability: probability of each floor under each wheel, in the order of `labels`;
-            the last column is the probability that it is none of them [1].
+            the last column is the probability of a floor that is none of them [1].
         covariance: covariance of the pose in the world frame, in products of [m, m, rad].
-        stale: whether readings of a wheel are missing for too long.
-        immobilised: whether the wheels turn while the body stands still.
-        out_of_range: whether speed or currents exceed those of the fitted runs, or the floor is
+        stale: True if readings of a wheel have been missing for too long.
+        immobilised: True if the wheels turn while the body stands still.
+        out_of_range: True if speed or currents far exceed those of the fitted runs, or the floor is
             unknown.
         labels: names of the floors.
     """
@@ -191,13 +193,13 @@ class StateEstimate(eqx.Module):
 
     @property
     def surface(self) -> np.ndarray:
-        """Name of the most probable floor under each wheel, or `NO_FLOOR` if none fits."""
+        """Name of the most probable floor under each wheel; `NO_FLOOR` if that is none of them."""
         names = np.array([*self.labels, NO_FLOOR])
         return np.asarray(names[np.argmax(np.asarray(self.surface_probability), axis=-1)])
 
     @property
     def finite(self) -> Bool[Array, ""]:
-        """Whether every number of the estimate is finite."""
+        """True if every number of the estimate is finite."""
         parts = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self) if x.dtype != bool]
         return jnp.all(jnp.stack(parts))
 
@@ -216,7 +218,7 @@ class AbstractEstimator(eqx.Module, Generic[State]):
     def advance(
         self, state: State, z: Readings, dt: Float[Array, ""]
     ) -> tuple[State, StateEstimate]:
-        """Return the result of `step`, given readings with all fields; `dt` is in [s]."""
+        """Return the result of `step` for complete readings and a time step `dt` [s]."""
 
     def step(
         self, state: State, measurement: Measurement | Readings, dt: Float[Numbers, ""] | float

@@ -53,9 +53,9 @@ UNITS = {
 
 @dataclass(frozen=True)
 class RecordedNumber:
-    """A fitted or fixed number of the robot, with the attributes that identified.json has.
+    """A parameter of the robot with its uncertainty and origin, as in identified.json.
 
-    By default it is a number that was given, not fitted.
+    The defaults describe a parameter that was given, not fitted.
 
     Attributes:
         value: value [unit].
@@ -78,19 +78,19 @@ class RecordedNumber:
 
 
 def plain(value: np.ndarray) -> Numbers:
-    """Return an array as a float if it has one element, else as a tuple of floats."""
+    """Convert an array to a float if it has one element, else to a tuple of floats."""
     return float(value.reshape(())) if value.size == 1 else tuple(float(v) for v in value)
 
 
 def axes_of(row: Iterable[float] | np.ndarray) -> Axes:
-    """Return three numbers as a tuple of floats."""
+    """Convert three numbers (along, across, yaw) to a tuple of floats."""
     along, across, yaw = (float(x) for x in row)
     return along, across, yaw
 
 
 @dataclass(frozen=True)
 class Wheels:
-    """The shape of the robot, with the attributes of `slipid.model.geometry.Geometry`."""
+    """Arrangement of the wheels, with attributes of `slipid.model.geometry.Geometry`."""
 
     place: tuple[Pair, ...]
     drive_angle: tuple[float, ...]
@@ -106,11 +106,11 @@ class FloorRecord:
 
     Attributes:
         name: name of the floor.
-        process: std of errors that grow with the root of the path length.
-        effect: std of effects, errors that stay the same over the path.
+        process: std of motion errors that grow with the root of the path length.
+        effect: std of effects, motion errors that stay the same over the path.
         current_std: std of measured less modelled currents, without the ammeters' noise.
-        seen: ranges of speed, torque and so on that the fitted runs cover; None if the numbers were
-            given, not fitted.
+        seen: ranges of speed, torque and so on that the fitted runs cover; None if the parameters
+            were given, not fitted.
         unseen: True for a floor that no run drove on, see `slipid.robot.unseen`.
     """
 
@@ -132,7 +132,8 @@ class EffectRecord:
     Attributes:
         speeds: speeds of the rows, rising.
         mean: estimated effect, to be added to the motion that the model predicts.
-        left: remaining std, which includes the uncertainty of the robot's parameters.
+        left: std of the effect that remains after `mean` is added; it includes the uncertainty of
+            the robot's parameters.
     """
 
     speeds: tuple[float, ...]
@@ -146,11 +147,12 @@ class LoadRecord:
 
     Attributes:
         name: name of the load set-up.
-        spread: std of the motion per metre on every floor due to the parameters' uncertainty.
+        spread: std of the motion per metre on every floor that is due to uncertain parameters.
         told: effect table of this load set-up; None if the robot was not fitted to runs.
-        highest_current: largest current that the model predicts up to 0.8 of the highest wheel
+        highest_current: largest current that the model predicts at up to 0.8 of the highest wheel
             speed.
-        wheel_curve: a and b of a + b |I|, the slip ratio of each drive over all floors.
+        wheel_curve: a and b of the slip ratio a + b |I| of each drive at a current I, fitted over
+            all floors.
     """
 
     name: str
@@ -160,7 +162,7 @@ class LoadRecord:
     wheel_curve: tuple[Pair, ...]
 
     def on(self, rows: tuple[int, ...]) -> "LoadRecord":
-        """Return the record with only the floors number `rows`."""
+        """Return the record with only the floors whose indices are `rows`."""
         spread = tuple(self.spread[k] for k in rows)
         if self.told is None:
             return replace(self, spread=spread)
@@ -179,7 +181,7 @@ class LogSensors:
 
 @dataclass(frozen=True)
 class GainRecord:
-    """Value of a gain [unit], and its std among the last candidates of the search [unit]."""
+    """Value of a tuned gain [unit], and its spread among the search's last candidates [unit]."""
 
     value: float
     unit: str
@@ -188,7 +190,7 @@ class GainRecord:
 
 @dataclass(frozen=True)
 class GainValues:
-    """All gains of `slipid.robot.controller.Gains`, and `ahead`, which is no longer used.
+    """All gains of `slipid.robot.controller.Gains`, and the gain `ahead`, which is no longer used.
 
     Attributes:
         place: gain of the position loop.
@@ -196,7 +198,7 @@ class GainValues:
         integral: gain of the integral of the position error.
         ahead: fraction of the wheel speeds that earlier controllers took from the contact model.
         observer: gain of the disturbance observer.
-        preview: time by which reference rates are taken ahead of the reference pose.
+        preview: time by which reference rates are read ahead of the reference pose on the path.
     """
 
     place: GainRecord
@@ -211,7 +213,7 @@ class GainValues:
 class Losses:
     """Losses of the gains set by hand and of the tuned gains, on cases not used for tuning.
 
-    A loss is the mean over the cases plus the mean over the worst tenth of them.
+    A loss is the mean error over the cases plus the mean error over the worst tenth of the cases.
     """
 
     hand: float
@@ -225,10 +227,10 @@ class GainsRecord:
     Attributes:
         values: the gains.
         load: load set-up for which they were tuned.
-        gyro: whether the robot had a gyro.
+        gyro: True if the robot had a gyro during tuning.
         method: method of the search.
         loss: losses of the gains set by hand and of the tuned gains.
-        better_than_hand: fraction of the cases in which the tuned gains win.
+        better_than_hand: fraction of the cases in which tuned gains have the smaller loss.
         stability_margin: 1 less the largest spectral radius of the linearized loops.
         verdict: comparison of the losses; "better" or "worse" if they differ by more than chance.
     """
@@ -244,7 +246,7 @@ class GainsRecord:
 
     @property
     def is_better(self) -> bool:
-        """Whether the tuned gains are used instead of those set by hand."""
+        """True if the tuned gains are to be used instead of the gains set by hand."""
         return self.verdict == "better than by hand"
 
 
@@ -254,18 +256,19 @@ class RobotRecord:
 
     Attributes:
         source: method that the parameters come from.
-        wheels: shape of the robot.
-        parameters: numbers of the robot by path, such as `robot.mass`.
+        wheels: arrangement of the wheels.
+        parameters: parameters of the robot, keyed by path such as `robot.mass`.
         floors: floors in the order of the arrays.
         loads: load set-ups in the order of the arrays.
-        current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v.
+        current_trend: a and b of the excess a + b v of measured over modelled currents at a body
+            speed v.
         highest_speed: highest wheel speed of the fitted runs.
         sensors: sensors of the logs.
-        alike: decrease of the log probability for each further floor under the robot; it is smaller
-            if the fit used runs over several floors.
+        alike: decrease of the log probability of a hypothesis for each further floor under the
+            robot; it is smaller if the fit used runs over several floors.
         messages: messages for users of the parameters.
         data: hash of the runs; None if the parameters were given, not fitted.
-        versions: versions of the software that computed the numbers.
+        versions: versions of the software that computed the parameters.
         draws: posterior draws of the fitted parameters, keyed by path.
         gains: tuned gains; None if there are none.
     """
@@ -311,10 +314,10 @@ class RobotRecord:
         return tuple(floor.name for floor in self.floors)
 
     def load_index(self, name: str | None) -> int:
-        """Return the position of a load set-up, the first by default.
+        """Return the index of a load set-up in `loads`, 0 by default.
 
         Raises:
-            ValueError: there is no load set-up of this name; the message lists those that exist.
+            ValueError: there is no load set-up of this name; the message lists the existing ones.
         """
         names = [load.name for load in self.loads]
         if name not in (None, *names):
@@ -322,7 +325,7 @@ class RobotRecord:
         return 0 if name is None else names.index(name)
 
     def on(self, rows: tuple[int, ...]) -> "RobotRecord":
-        """Return the record with only the floors number `rows`."""
+        """Return the record with only the floors whose indices are `rows`."""
         floors = tuple(self.floors[k] for k in rows)
         kept = tuple(f"surface.{floor.name}." for floor in floors)
 

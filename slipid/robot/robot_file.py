@@ -31,17 +31,17 @@ _PLAIN = {bool: "true or false", str: "text", int: "a whole number", NoneType: "
 
 
 def typed(kind: Any, value: object, where: str = "") -> Any:
-    """Return a JSON value as a dataclass; numbers must be finite and keys complete and known.
+    """Convert a JSON value to a dataclass; numbers must be finite, keys complete and known.
 
     Args:
         kind: a dataclass, or the type of one of its fields: bool, int, float, str, None, a
             `Literal`, a tuple, a mapping by str, a union or a dataclass.
         value: value returned by `json.loads`.
-        where: position of the value in the file, such as `floors[0].name`, for messages.
+        where: path of the value in the file, such as `floors[0].name`, for messages.
 
     Raises:
-        ValueError: something is missing, unknown or of another type; the message gives its
-            position.
+        ValueError: a key is missing or unknown, or a value has another type; the message gives its
+            path in the file.
     """
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
@@ -96,7 +96,7 @@ def _object(kind: Any, value: object, where: str) -> Any:
     names = [f.name for f in fields(kind)]
     for name in names:
         if name not in value:
-            raise ValueError(f"{before}{name} is missing")
+            raise ValueError(f"the field {before}{name} is missing")
     for name in value:
         if name not in names:
             raise ValueError(f"{before}{name}: no such field; expected {', '.join(names)}")
@@ -132,7 +132,9 @@ def read_robot(path: Path) -> RobotRecord:
     written, computed = content.pop("checksum", None), checksum(content)
     content.pop("schema")
     if content.pop("units", None) != UNITS:
-        raise DataError(f"{path}: its units differ from those of {SCHEMA}; {REWRITE_HINT}")
+        raise DataError(
+            f"{path}: the units in this file differ from the units of {SCHEMA}; {REWRITE_HINT}"
+        )
     numbers = content.pop("numbers", None)
     try:
         record: RobotRecord = typed(RobotRecord, content)
@@ -168,7 +170,7 @@ def _content(path: Path) -> dict[str, object]:
         newer = int(schema.partition("/")[2]) > int(SCHEMA.partition("/")[2])
         age, then = ("a newer", "update slipid") if newer else ("an older", REWRITE_HINT)
         raise DataError(
-            f"{path}: written by {age} slipid as {schema}, this one reads {SCHEMA}; {then}"
+            f"{path}: written by {age} slipid as {schema}, but this slipid reads {SCHEMA}; {then}"
         )
     return dict(content)
 
@@ -185,7 +187,7 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def _text(value: object, indent: str = "") -> str:
-    """Return JSON text with one line per key of an object, and lists without objects on a line."""
+    """Return JSON text with one line per key of an object; a list without objects is one line."""
     inner = indent + " "
     if isinstance(value, dict) and value:
         rows = [f"{inner}{json.dumps(k)}: {_text(v, inner)}" for k, v in value.items()]
@@ -202,14 +204,15 @@ def check_record(record: RobotRecord) -> None:
     """
     wheels = len(record.wheels.place)
     if not wheels:
-        raise ValueError("wheels.place: no entries; expected one for every wheel")
+        raise ValueError("wheels.place: no entries; expected one entry for every wheel")
     for name in ("drive_angle", "roller_angle", "grips"):
         _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
-    drives = geometry_of(record).drives  # raises for wheels that cannot drive, or without a drive
+    # Geometry itself raises ValueError for wheels that cannot drive, or without a drive
+    drives = geometry_of(record).drives
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):
             raise ValueError(
-                f"{kind} {list(names)}; expected at least one name, and each only once"
+                f"{kind} {list(names)}; expected at least one name, and each name only once"
             )
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
@@ -238,15 +241,15 @@ def _check_effects(where: str, table: EffectRecord, floors: int) -> None:
     for name, by_floor in (("mean", table.mean), ("left", table.left)):
         _counted(f"{where}.{name}", by_floor, floors)
         for rows in by_floor:
-            _counted(f"{where}.{name}, of a floor", rows, len(speeds))
+            _counted(f"{where}.{name}, rows of a floor", rows, len(speeds))
             for row in rows:
-                _counted(f"{where}.{name}, of a speed", row, max(around, 1))
+                _counted(f"{where}.{name}, directions of a speed", row, max(around, 1))
     if any(x < 0 for rows in table.left for row in rows for axes in row for x in axes):
-        raise ValueError(f"{where}.left: a std below 0")
+        raise ValueError(f"{where}.left: a std is below 0; expected 0 or more")
 
 
 def declared_numbers(record: RobotRecord) -> tuple[Entry, ...]:
-    """Return the declarations of all numbers of a robot of this shape, without the camera's."""
+    """Return the declarations of all parameters of a record's robot, except the camera's."""
     robot = build(geometry_of(record), record.labels, [load.name for load in record.loads])
     return tuple(e for e in entries(robot) if e.part != "camera")
 
@@ -258,7 +261,10 @@ def _numbers(record: RobotRecord) -> None:
             raise ValueError(f"parameters['{path}'] is missing")
     for path in (*record.parameters, *record.draws):
         if path not in known:
-            raise ValueError(f"'{path}': not a parameter of a robot with these floors and loads")
+            raise ValueError(
+                f"'{path}' is not a parameter of a robot with the record's wheels, floors and load "
+                f"set-ups; expected a path such as '{next(iter(known))}'"
+            )
     for path, number in record.parameters.items():
         (declaration, size), where = known[path], f"parameters['{path}']"
         _inside(f"{where}.value", number.value, declaration, size)
@@ -267,11 +273,15 @@ def _numbers(record: RobotRecord) -> None:
         if number.std is not None:
             _sized(f"{where}.std", number.std, size)
         if number.interval90 is not None and (np.ndim(number.interval90) > 1) != (size > 1):
-            raise ValueError(f"{where}.interval90: expected {size} intervals")
+            raise ValueError(
+                f"{where}.interval90: wrong number of intervals; expected {size}, one for each "
+                "element of the parameter"
+            )
     counts = {len(rows) for rows in record.draws.values()}
     if len(counts) > 1 or 0 in counts:
         raise ValueError(
-            f"draws: {sorted(counts)} draws of different parameters; expected equally many of each"
+            f"draws: parameters have {sorted(counts)} draws; expected the same number, at least 1, "
+            "for every parameter"
         )
     for path, rows in record.draws.items():
         for k, row in enumerate(rows):
@@ -285,7 +295,10 @@ def _counted(name: str, values: tuple[object, ...], count: int) -> None:
 
 def _sized(where: str, value: Numbers, size: int) -> None:
     if np.shape(value) != (() if size == 1 else (size,)):
-        raise ValueError(f"{where}: expected {'one number' if size == 1 else f'{size} numbers'}")
+        raise ValueError(
+            f"{where}: {np.size(value)} elements; expected "
+            f"{'one number' if size == 1 else f'a list of {size} numbers'}"
+        )
 
 
 def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> None:

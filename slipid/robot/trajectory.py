@@ -1,4 +1,4 @@
-"""Paths over time: reference poses and rates, with a time that waits for a robot that lags."""
+"""Paths over time: reference poses and rates, whose time stops while the robot lags behind."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -11,20 +11,20 @@ from jaxtyping import Array, Float
 ROW_PERIOD = 0.02
 """Time between two rows of a path [s]."""
 FULL_SPEED_M, WAIT_M = 0.02, 0.12
-"""Distances of the robot from its reference below which a path keeps its speed, and above which it
-stops and waits; in between it slows down linearly [m]."""
+"""Distance of the robot from its reference up to which a path keeps its speed, and distance above
+which the path stops and waits; in between the path slows down linearly [m]."""
 LONGEST_STEP = 0.5
 """Largest time step by which a path advances [s]."""
 
 
 class Path(eqx.Module):
-    """Pose and twist in the world over the time of the path, which waits for a robot that lags.
+    """Reference pose and its rates in the world, over a time that waits for a robot that lags.
 
     Attributes:
         rows: x, y [m], heading [rad] and their rates [m/s, m/s, rad/s], one row every `ROW_PERIOD`.
-        marks: times at which a side (including the rest at its end) or a quarter of a curve ends
-            [s].
-        corners: reference positions at these times (mark, 2) [m].
+        marks: times of the path at which a side (including the rest at its end) or a quarter of a
+            curve ends [s].
+        corners: reference positions at the times `marks` [m].
     """
 
     rows: Float[Array, "row 6"]
@@ -37,7 +37,7 @@ class Path(eqx.Module):
         return (len(self.rows) - 1) * ROW_PERIOD
 
     def at(self, time: Float[Array, ""] | float) -> Float[Array, "6"]:
-        """Return pose and rates at a time of the path [s]; outside it, those of the nearer end."""
+        """Return pose and rates at a time of the path [s], limited to the path's duration."""
         place = jnp.clip(jnp.asarray(time) / ROW_PERIOD, 0.0, len(self.rows) - 1.000001)
         low = jnp.floor(place).astype(jnp.int32)
         high, part = jnp.minimum(low + 1, len(self.rows) - 1), place - low
@@ -56,13 +56,13 @@ class Path(eqx.Module):
         dt: Float[Array, ""] | float,
         preview: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
-        """Return the time of the path one step later, and the reference at that time.
+        """Return the time of the path one step later, and the reference at the new time.
 
-        The reference consists of the pose at that time and the rates `preview` [s] later.
+        The reference consists of the pose at the new time and the rates `preview` [s] later.
 
         The path slows down, and its rates with it, while the robot's estimated `pose` lags behind
-        it or is off to the side; it does not wait for a robot that is ahead. A `dt` [s] that is not
-        a positive number counts as 0; the time advances by at most `LONGEST_STEP`.
+        the reference or is off to the side; the path does not wait for a robot that is ahead. A
+        `dt` [s] that is not a positive number counts as 0; time advances by at most `LONGEST_STEP`.
         """
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST_STEP), 0.0)
@@ -79,7 +79,7 @@ class Path(eqx.Module):
         return time, jnp.concatenate([self.at(time)[:3], rates])
 
     def moved(self, start: Sequence[float]) -> "Path":
-        """Return the path moved so that it begins at a pose (x, y [m], heading [rad])."""
+        """Move the path so that it begins at a pose (x, y [m], heading [rad])."""
         x, y, heading = (float(v) for v in start)
         c, s = np.cos(heading), np.sin(heading)
         turn = np.array([[c, s], [-s, c]])
@@ -91,7 +91,7 @@ class Path(eqx.Module):
         return Path(jnp.asarray(rows), self.marks, jnp.asarray(corners))
 
     def after_rest(self, seconds: float) -> "Path":
-        """Return the path preceded by a rest of this duration at its start."""
+        """Return the path preceded by a rest of `seconds` [s] at its start."""
         count, rows = round(seconds / ROW_PERIOD), np.asarray(self.rows)
         still = np.tile(rows[0] * [1, 1, 1, 0, 0, 0], (count, 1))
         marks = jnp.asarray(np.asarray(self.marks) + count * ROW_PERIOD)
@@ -105,18 +105,18 @@ def waypoints(
     pause: float = 0.6,
     turn: float = 0.0,
 ) -> Path:
-    """Return a path of straight lines between way-points, with a stop at each.
+    """Return a path of straight lines between way-points, with a stop at each way-point.
 
     Args:
-        places: way-points x, y [m]; the first one is the start.
+        places: way-points x, y [m]; the path starts at the first one.
         speed: speed between stops [m/s].
         acceleration: acceleration at both ends of each line [m/s^2].
-        pause: rest at every way-point [s].
+        pause: rest at every way-point after the start [s].
         turn: change of heading on each line [rad].
 
     Raises:
-        ValueError: there are fewer than two way-points, two consecutive ones are equal, or a speed
-            or acceleration is not positive.
+        ValueError: there are fewer than two way-points, two consecutive way-points are equal, or
+            the speed or the acceleration is not positive.
     """
     _positive(speed, acceleration)
     p = np.asarray(places, float)
@@ -127,7 +127,8 @@ def waypoints(
         length = float(np.hypot(*(b - a)))
         if length < 1e-9:
             raise ValueError(
-                f"way-point {b.tolist()} twice in succession; expected different way-points"
+                f"way-point {b.tolist()} occurs twice in succession; expected consecutive "
+                "way-points that differ"
             )
         distance, rate = _trapezoid(length, speed, acceleration, pause)
         line = np.array([*(b - a), turn]) / length
@@ -159,23 +160,26 @@ def curve(
     acceleration: float = 0.5,
     pause: float = 0.6,
 ) -> Path:
-    """Return a smooth path driven without turning and without stops, at rest in the end.
+    """Return a smooth path that is driven without turning and with a stop only at its end.
 
     Args:
-        places: points x, y on the curve, connected by straight lines and therefore dense [m].
-        speed: speed along it [m/s].
-        acceleration: acceleration at its ends [m/s^2].
-        pause: rest at its end [s].
+        places: points x, y on the curve [m]; they must be dense, since straight lines connect them.
+        speed: speed along the curve [m/s].
+        acceleration: acceleration at both ends of the curve [m/s^2].
+        pause: rest at the curve's end [s].
 
     Raises:
-        ValueError: there are fewer than two points, two consecutive ones are equal, or a speed or
-            acceleration is not positive.
+        ValueError: there are fewer than two points, two consecutive points are equal, or the speed
+            or the acceleration is not positive.
     """
     _positive(speed, acceleration)
     p = np.asarray(places, float)
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
     if len(p) < 2 or np.diff(length).min() < 1e-9:
-        raise ValueError("places of a curve; expected two or more, each different from the last")
+        raise ValueError(
+            f"curve of {len(p)} points, or with equal consecutive points; expected two or more "
+            "points, each different from the previous point"
+        )
     distance, rate = _trapezoid(float(length[-1]), speed, acceleration, pause)
     distance, rate = np.append(0.0, distance), np.append(0.0, rate)
     place = np.stack([np.interp(distance, length, x) for x in p.T], axis=1)
@@ -188,18 +192,24 @@ def curve(
 
 
 def circle(radius: float = 0.35, speed: float = 0.2) -> Path:
-    """Return a full circle to the right, driven without turning; units are [m], [m/s]."""
+    """Return a full circle to the right, driven without turning; `radius` [m], `speed` [m/s]."""
     return curve(_round(radius), speed)
 
 
 def eight(radius: float = 0.25, speed: float = 0.2) -> Path:
-    """Return a circle to the right, then one to the left, driven without turning [m], [m/s]."""
+    """Return a circle to the right, then one to the left, driven without turning.
+
+    `radius` is in [m], `speed` in [m/s].
+    """
     right = _round(radius)
     return curve(np.concatenate([right, right[1:] * [1.0, -1.0]]), speed)
 
 
 def turning(speed: float = 0.2) -> Path:
-    """Return the 2021 paper's rectangle with a quarter turn to the right on each side [m/s]."""
+    """Return the 2021 paper's rectangle with a quarter turn to the right on each side.
+
+    `speed` is in [m/s].
+    """
     return rectangle(speed=speed, turn=-0.5 * np.pi)
 
 
@@ -209,7 +219,7 @@ PATHS: Mapping[str, Callable[[float], Path]] = {
     "eight": lambda speed: eight(speed=speed),
     "turning": turning,
 }
-"""Paths of a trial by name; each function takes a speed [m/s] and returns the path."""
+"""Functions that return a path of `slipid trial` for a speed [m/s], keyed by the path's name."""
 
 
 def _round(radius: float) -> Float[np.ndarray, "place 2"]:
@@ -221,15 +231,18 @@ def _round(radius: float) -> Float[np.ndarray, "place 2"]:
 def _positive(speed: float, acceleration: float) -> None:
     """Raise `ValueError` unless speed and acceleration are both positive."""
     if not (speed > 0 and acceleration > 0):
-        raise ValueError(f"speed {speed}, acceleration {acceleration}; expected positive numbers")
+        raise ValueError(
+            f"speed {speed} m/s, acceleration {acceleration} m/s^2; expected positive numbers"
+        )
 
 
 def _trapezoid(
     length: float, speed: float, acceleration: float, pause: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance [m] and speed [m/s] over time on a straight line with a rest at its end.
+    """Return distance [m] and speed [m/s] over time on a line of this `length` [m], with a rest.
 
-    Rows are `ROW_PERIOD` apart. The speed rises, stays constant and falls (trapezoidal profile).
+    Rows are `ROW_PERIOD` apart, from one period after the start. The speed rises, stays constant
+    and falls (trapezoidal profile); then the robot rests for `pause` [s].
     """
     top = min(speed, float(np.sqrt(length * acceleration)))
     ramp = top / acceleration

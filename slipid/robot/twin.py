@@ -8,8 +8,9 @@ run, with effects as in `slipid.robot.filter.effects`:
     xi = equilibrium(r w; floor under each wheel)
     pose <- pose * exp(xi h + s h (estimated + remaining effect) + sqrt(s h) process)
 
-with h the substep [s], `set` the set speeds and w the wheel speeds [rad/s], r the wheel radius [m],
-xi the body twist [m/s, m/s, rad/s] and s the speed of the body if no wheel slipped [m/s].
+with h the substep [s], `set` the set-point speeds of the wheels' speed control and w the wheel
+speeds [rad/s], r the wheel radius [m], xi the body twist [m/s, m/s, rad/s] and s the speed of the
+body if no wheel slipped [m/s].
 
 Everything is differentiable except for the choice of the floor under a wheel; derivatives ignore
 the quantization of encoders. Use forward mode (`jax.jvp`, `jax.jacfwd`), since NaN readings would
@@ -33,18 +34,19 @@ from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import Measurement, Pose, Readings
 
 KEPT_COMMANDS = 6
-"""Number of past commands that are kept; the delay is at most `KEPT_COMMANDS` - 1 periods."""
+"""Number of commands that are kept, including the newest; the delay is at most `KEPT_COMMANDS` - 1
+periods."""
 
 
 @dataclass(frozen=True)
 class ActuatorModel:
-    """Response of the wheels to commands and noise of the sensors, which are not fitted.
+    """Response of the wheels to commands, and noise of the sensors; neither is fitted.
 
     Attributes:
         delay_s: time until a command reaches the wheels [s].
         slew: largest acceleration of the wheels [rad/s^2].
         lag_s: time constant of the wheels' speed control [s].
-        ticks: ticks of an encoder per turn of the wheel.
+        ticks: encoder ticks per turn of the wheel.
         ammeter_a: std of the noise of a measured current [A].
         drift_s: correlation time of the errors of modelled currents [s].
         voltmeter_v: std of the noise of a measured voltage [V].
@@ -79,23 +81,22 @@ class ActuatorModel:
 
     @property
     def lag_gain(self) -> float:
-        """Fraction of the difference between set and wheel speed that a substep removes [1]."""
+        """Fraction of the gap between set-point and wheel speed that a substep closes [1]."""
         return 1 - float(np.exp(-self.substep / max(self.lag_s, 1e-6)))
 
     def command_weights(self) -> Float[np.ndarray, "substep command"]:
         """Return the weights of the last commands, newest first, in the mean command of a substep.
 
-        A command holds for a period and arrives after the delay. The weights are exact, and
-        piecewise linear in the delay.
+        A command holds for a period and reaches the wheels after the delay. A weight is the
+        fraction of the substep in which that command acts; it is piecewise linear in the delay.
         """
         h = self.substep
         begin = np.arange(self.substeps)[:, None] * h - self.delay_s
         since = -np.arange(KEPT_COMMANDS)[None, :] * PERIOD
         both = np.minimum(begin + h, since + PERIOD) - np.maximum(begin, since)
         share = np.clip(both, 0.0, None) / h
-        share[:, -1] += 1.0 - share.sum(
-            axis=1
-        )  # The oldest kept command stands for all older ones.
+        # give the remaining weight, of commands that are no longer kept, to the oldest kept one
+        share[:, -1] += 1.0 - share.sum(axis=1)
         return share
 
 
@@ -105,16 +106,15 @@ class TwinState(eqx.Module):
     Attributes:
         pose: x, y [m], heading [rad].
         twist: velocity of the body in its own axes [m/s, m/s, rad/s].
-        wanted: set speeds of the wheels' speed control [rad/s].
+        wanted: set-point speeds of the wheels' speed control [rad/s].
         speed: wheel speeds [rad/s].
         angle: wheel angles [rad].
         effect: present effect of every floor beyond its estimate, in units of its remaining std.
         toward: settled direction of travel, see `slipid.robot.filter.effects`.
-        offset: constant error of the currents in this run [A].
-        drift: correlated error of the currents [A].
+        offset: error of the modelled currents that is constant in a run [A].
+        drift: error of the modelled currents that is correlated over time [A].
         bias: bias of the gyro [rad/s].
-        ring: last commands, the newest first, some of which have not reached the wheels yet
-            [rad/s].
+        ring: last commands, the newest first [rad/s]; the newest have not reached the wheels yet.
     """
 
     pose: Float[Array, "3"]
@@ -144,18 +144,20 @@ class Twin(eqx.Module):
     actuators: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
-        """Raise `ValueError` for a delay longer than the time of the kept commands."""
+        """Raise `ValueError` for a delay below 0 or longer than the time of the kept commands."""
         most = (KEPT_COMMANDS - 1) * PERIOD
         if not 0 <= self.actuators.delay_s <= most:
-            raise ValueError(f"delay_s = {self.actuators.delay_s}; expected 0 to {most:g}")
+            raise ValueError(
+                f"delay_s = {self.actuators.delay_s}; expected a delay from 0 to {most:g} s"
+            )
 
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
-        """Return the standard normal random numbers of step `number`; 0 is the reading at rest."""
+        """Return the standard normal random numbers of step `number`, which is 0 for `first`."""
         count = 3 * (self.robot.wheels + self.actuators.substeps + len(self.robot.labels)) + 1
         return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
     def init(self, pose: Pose, key: Array) -> TwinState:
-        """Return the state at rest at a pose [m, m, rad], with random errors for this run."""
+        """Return the state at rest at a pose [m, m, rad], with this run's errors drawn by `key`."""
         f, w = self.robot, (self.robot.wheels,)
         one, two, three = jax.random.split(jax.random.fold_in(key, 2**31 - 1), 3)
         off = jax.random.normal(two, w) * jnp.mean(f.current_std) / jnp.sqrt(2.0)
@@ -177,7 +179,7 @@ class Twin(eqx.Module):
     def step(
         self, state: TwinState, command: Float[Array, " wheel"], noise: Float[Array, " noise"]
     ) -> tuple[TwinState, Readings]:
-        """Return state and readings one period after a command [rad/s]."""
+        """Return state and readings one control period after a command [rad/s] is given."""
         old, b, h = state, self.actuators, self.actuators.substep
         ring = jnp.concatenate([command[None], old.ring[:-1]])
         shares = jnp.asarray(b.command_weights())
@@ -197,14 +199,17 @@ class Twin(eqx.Module):
         return now, self._read(angle, w, amps, turned + old.bias, noise)
 
     def first(self, state: TwinState, noise: Array) -> Readings:
-        """Return the readings of a robot at rest."""
+        """Return the readings at rest, before the first command."""
         still = jnp.zeros_like(state.speed)
         return self._read(state.angle, state.speed, still, state.bias, noise)
 
     def _roll(
         self, pose: Array, w: Array, effect: Array, push: Array, h: float
     ) -> tuple[Array, Array]:
-        """Return the pose one substep later, and the twist by contact equilibrium."""
+        """Return the pose one substep later, and the twist by contact equilibrium.
+
+        The pose also moves by the effects and by the random errors of the floors under the wheels.
+        """
         f = self.robot
         under = self.floor.under(pose, f.places)
         xi = f.standing(under).twist(w)
@@ -216,7 +221,7 @@ class Twin(eqx.Module):
         return compose(pose, advance(xi + rolled.axes @ off / h, h)), xi
 
     def _effects(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
-        """Return effects of the floors and settled direction for the next period."""
+        """Return the floors' effects and the settled direction for the next control period."""
         f, xi = self.robot, now.twist
         far = (jnp.sqrt(xi[:2] @ xi[:2] + 1e-12) + f.frame.base * jnp.abs(xi[2])) * PERIOD
         under = self.floor.under(now.pose, f.places)
@@ -227,20 +232,21 @@ class Twin(eqx.Module):
         return keep[:, None] * now.effect + fresh, toward
 
     def _currents(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
-        """Return signed currents [A], and their correlated errors after this period [A]."""
+        """Return signed currents [A], and the new value of their correlated errors [A]."""
         f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
         under = self.floor.under(now.pose, f.places)
         keep = float(np.exp(-PERIOD / self.actuators.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
-        moves = jnp.tanh(w / 0.2) ** 2  # A motor at standstill draws no current.
+        # a motor at standstill draws no current, so the errors fade out there as well
+        moves = jnp.tanh(w / 0.2) ** 2
         model = f.standing(under).current(xi, w)
         free = (f.inverse @ (f.frame.radius * w))[:2]
         more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
         return model + moves * (jnp.sign(model) * more + now.offset + drift), drift
 
     def _read(self, angle: Array, w: Array, amps: Array, turn: Array, noise: Array) -> Readings:
-        """Return the readings, with NaN for all quantities that the robot does not measure."""
+        """Return noisy readings, with NaN for all quantities that the robot does not measure."""
         b, wheels = self.actuators, self.robot.wheels
         _, by_amps, by_volts, by_turn = jnp.split(
             noise[3 * b.substeps :], [wheels, 2 * wheels, 3 * wheels]

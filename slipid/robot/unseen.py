@@ -1,12 +1,12 @@
 """Hypothetical floors for a robot that may drive on floors without identified parameters.
 
 Floors differ mainly in softness. Over the floors in the public logs of 2022 and on the virtual test
-site, the logarithm of roller drag rises with the logarithm of creep at a slope of 0.8. So a floor
-without a run is assumed to be the geometric mean of the known floors, made softer or harder, with
-more friction or less. Currents and a gyro show which of these an unfamiliar floor resembles;
-without these sensors the hypothetical floors have little influence, since their prior probability
-is low. Their parameters are not identified, and the motion on them is uncertain by a tenth of the
-path length and 0.3 rad per metre.
+site, the logarithm of roller drag rises with the logarithm of creep at a slope of 0.8. So a
+hypothetical floor is the geometric mean of the known floors, made softer or harder along this
+slope, and with more or less friction. Currents and a gyro show which hypothetical floor an
+unfamiliar floor resembles; without these sensors the hypothetical floors have little influence,
+since their prior probability is low. Their parameters are not identified, and the motion on them is
+uncertain by a tenth of the path length and 0.3 rad per metre.
 """
 
 from dataclasses import replace
@@ -25,15 +25,16 @@ from slipid.robot.record import (
 )
 
 LOG_CREEPS = (-2.0, -1.0, 0.0, 1.0, 2.0)
-"""Logs of creep relative to the middle floor [1]; the declared prior std over floors is 1.5."""
+"""Log ratios of creep to that of the middle floor (see `_middle`) [1]. The range exceeds the prior
+std over floors, which is 1.5."""
 DRAG_EXPONENT = 0.8
-"""Exponent d of roller drag ~ creep^d over floors [1]."""
+"""Exponent d of the assumed proportionality of roller drag to creep^d over floors [1]."""
 LOG_FRICTIONS = (-0.4, 0.4)
-"""Logs of friction relative to the middle floor [1]; the declared prior std over floors is 0.5."""
+"""Log ratios of friction to that of the middle floor [1]; the prior std over floors is 0.5."""
 EFFECT: Axes = (0.1, 0.1, 0.3)
-"""Std of the effects on such a floor [m/m, m/m, rad/m]."""
+"""Std of the effects on a hypothetical floor [m/m, m/m, rad/m]."""
 CURRENT_FACTOR = 1.5
-"""Std of the currents' errors on such a floor, relative to the mean of the known floors [1]."""
+"""Std of modelled currents on a hypothetical floor, relative to the mean of known floors [1]."""
 _SIGNED = ("lead", "load_bias")
 _NAME = "unseen_{}"
 
@@ -41,10 +42,10 @@ _NAME = "unseen_{}"
 def with_unseen(record: RobotRecord) -> RobotRecord:
     """Return the robot with hypothetical floors `unseen_1`, `unseen_2`, ..., added at the end.
 
-    A robot that already has them is returned unchanged.
+    A robot that already has hypothetical floors is returned unchanged.
 
     Raises:
-        ValueError: a known floor has the name of one of them.
+        ValueError: a known floor has the name of a hypothetical floor.
     """
     if any(floor.unseen for floor in record.floors):
         return record
@@ -53,7 +54,8 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
     names = [_NAME.format(k + 1) for k in range(len(grid))]
     if taken := set(names) & set(record.labels):
         raise ValueError(
-            f"floor '{min(taken)}': this name is reserved for hypothetical floors without a run"
+            f"floor '{min(taken)}': this name is reserved for hypothetical floors without a run; "
+            "rename the floor"
         )
     parameters = dict(record.parameters)
     for name, (soft, grip) in zip(names, grid, strict=True):
@@ -76,7 +78,7 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
 def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
     """Return the parameters of the middle floor, keyed by name.
 
-    They are geometric means over the known floors; arithmetic means for parameters with a sign.
+    Parameters are geometric means over the known floors, or arithmetic means if they have a sign.
     """
     first = f"surface.{record.labels[0]}."
     middle_floor: dict[str, RecordedNumber] = {}
@@ -95,7 +97,7 @@ def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
 
 
 def _load(load: LoadRecord, count: int) -> LoadRecord:
-    """Return a load set-up extended by floors whose effects are unknown."""
+    """Return a load set-up extended by `count` floors whose effects are unknown."""
     spread = axes_of(np.mean(load.spread, axis=0))
     one = replace(load, spread=load.spread + (spread,) * count)
     if load.told is None:

@@ -62,7 +62,7 @@ def test_a_lens_without_a_floor_is_no_overhead_camera(tmp_path):
     path = tmp_path / "lens.json"
     path.write_text(json.dumps(changed(rotation_from_world=None)), encoding="utf-8")
     assert read_camera(path).rotation_from_world is None
-    with pytest.raises(DataError, match="a lens without a place above"):
+    with pytest.raises(DataError, match="a lens without a pose above"):
         OverheadCamera.load(path)
 
 
@@ -109,7 +109,7 @@ def test_dictionaries_and_pictures_that_are_not_there(tmp_path):
     assert marker_dictionary("dict_4x4_50").markerSize == 4
     with pytest.raises(DataError, match=r"no marker dictionary '4X4_51'.*4X4_50"):
         marker_dictionary("4X4_51")
-    for data, words in ((b"", "the file is empty"), (b"no picture", "not a picture")):
+    for data, words in ((b"", "the file is empty"), (b"no picture", "not an image")):
         (tmp_path / "a.png").write_bytes(data)
         with pytest.raises(DataError, match=words):
             read_picture(tmp_path / "a.png")

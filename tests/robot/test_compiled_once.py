@@ -185,7 +185,7 @@ def test_loading_another_robot_compiles_nothing(robots, tmp_path):
 
 def test_arrays_alone_have_no_settings_and_no_gains(robots):
     for made in (Estimator, Odometry, Controller):
-        with pytest.raises(ValueError, match="without its record"):
+        with pytest.raises(ValueError, match="this robot has arrays but no record"):
             made(robots[0].arrays)
     assert steps(Estimator(robots[0].arrays, ONE))[0] == pytest.approx(
         steps(Estimator(robots[0], ONE))[0], abs=0.0

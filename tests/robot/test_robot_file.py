@@ -143,7 +143,9 @@ def test_draws_are_robots_with_other_numbers(robot):
 
 def test_a_robot_whose_arrays_were_changed_is_not_saved(robot, tmp_path):
     changed = eqx.tree_at(lambda r: r.mass, robot, robot.mass + 1)
-    with pytest.raises(ValueError, match="arrays of this robot differ from its record"):
+    with pytest.raises(
+        ValueError, match="arrays of this robot were changed and differ from its record"
+    ):
         changed.save(tmp_path / "robot.json")
     assert not any(tmp_path.iterdir())
 
@@ -279,15 +281,15 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c["loads"][1]["told"]["mean"].pop(), "told.mean: 1 entries; expected 2"),
         (
             lambda c: c["loads"][1]["told"]["left"][0].pop(),
-            "told.left, of a floor: 1 entries; expected 2",
+            "told.left, rows of a floor: 1 entries; expected 2",
         ),
         (
             lambda c: c["loads"][1]["told"]["left"][1][0].pop(),
-            "told.left, of a speed: 1 entries; expected 2",
+            "told.left, directions of a speed: 1 entries; expected 2",
         ),
         (
             lambda c: c["loads"][1]["told"]["left"][0][0][0].__setitem__(2, -1),
-            "told.left: a std below 0",
+            "told.left: a std is below 0",
         ),
         (
             lambda c: c["wheels"].update(drive_angle=[0.0]),
@@ -304,7 +306,10 @@ def test_a_changed_digit_is_refused(path):
             lambda c: c["parameters"]["robot.load_share@own"].update(value=[1, 1, 1]),
             "that sum to 1",
         ),
-        (lambda c: c["parameters"]["robot.load_share@own"].update(std=1), "expected 3 numbers"),
+        (
+            lambda c: c["parameters"]["robot.load_share@own"].update(std=1),
+            "expected a list of 3 numbers",
+        ),
         (lambda c: c["parameters"].pop("surface.soft.drag_exponent"), "drag_exponent'] is missing"),
         (
             lambda c: c["parameters"]["surface.soft.load_bias"].update(value=[0.1, 0.1, 0.1]),
@@ -312,7 +317,7 @@ def test_a_changed_digit_is_refused(path):
         ),
         (
             lambda c: c["parameters"]["surface.soft.load_bias"].update(value=0.0),
-            "['surface.soft.load_bias'].value: expected 3 numbers",
+            "['surface.soft.load_bias'].value: 1 elements; expected a list of 3 numbers",
         ),
         (
             lambda c: c["draws"]["surface.soft.load_bias"].__setitem__(1, [0.1, 0.1, 0.1]),
@@ -320,22 +325,25 @@ def test_a_changed_digit_is_refused(path):
         ),
         (
             lambda c: c["draws"]["surface.soft.friction"].pop(),
-            "draws: [4, 5] draws of different parameters",
+            "draws: parameters have [4, 5] draws; expected the same number",
         ),
         (
             lambda c: c["draws"]["surface.soft.friction"].__setitem__(0, 0),
             "draws['surface.soft.frict",
         ),
-        (lambda c: c["draws"].update(mass=[1]), "'mass': not a parameter"),
-        (lambda c: c["units"].update(alike="m"), "its units differ from those of slipid.robot/6"),
+        (lambda c: c["draws"].update(mass=[1]), "'mass' is not a parameter"),
+        (
+            lambda c: c["units"].update(alike="m"),
+            "the units in this file differ from the units of slipid.robot/6",
+        ),
         (lambda c: c["gains"]["values"].pop("yaw"), "gains.values.yaw is missing"),
         (
             lambda c: c.update(loads=c["loads"][:1] * 2),
-            "expected at least one name, and each only once",
+            "expected at least one name, and each name only once",
         ),
         (
             lambda c: c.update(floors=[]),
-            "floors []; expected at least one name, and each only once",
+            "floors []; expected at least one name, and each name only once",
         ),
     ],
 )

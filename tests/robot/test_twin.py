@@ -46,7 +46,7 @@ def test_commands_arrive_late_as_a_fine_grid_says():
 
 
 def test_a_delay_beyond_the_ring_is_refused():
-    with pytest.raises(ValueError, match=r"delay_s = 0\.4; expected 0 to 0\.25"):
+    with pytest.raises(ValueError, match=r"delay_s = 0\.4; expected a delay from 0 to 0\.25 s"):
         Twin(deployed(), FIRM, ActuatorModel(delay_s=0.4))
 
 

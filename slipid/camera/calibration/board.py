@@ -1,4 +1,4 @@
-"""A printed ChArUco board, its corners in pictures, and the selection of usable views."""
+"""A printed ChArUco board, its corners in images, and the selection of usable views."""
 
 import glob
 from collections.abc import Sequence
@@ -23,24 +23,24 @@ from slipid.support.errors import DataError
 LARGEST_M = 1.0
 """Largest edge of a square [m]; a larger number was probably meant in millimetres."""
 LEAST_CORNERS = 6
-"""Smallest number of corners in a view: a pose has six unknowns, and each corner gives two
-equations."""
+"""Smallest number of corners in a usable view. A pose has six unknowns and each corner gives two
+equations, so three corners would leave no equation for the lens."""
 SEARCHED_PICTURES = 3
-"""Number of pictures that are searched for other boards if the given board is not detected. It is
-small because every dictionary is tried on each picture."""
+"""Number of images that are searched for other boards if the given board is not detected; few,
+because every dictionary is tried on each image."""
 ENOUGH_DETECTIONS = 4
-"""Smallest number of detected markers or corners that is taken as proof of a board, since so many
-are unlikely by chance."""
+"""Smallest number of detected markers or corners with which a board counts as present; so many
+false detections at once are unlikely."""
 LEAST_VIEWS = 6
-"""Smallest number of usable views, and of those that differ from each other."""
+"""Smallest number of usable views; as many must also differ from each other."""
 SAME_VIEW = 0.08
-"""Difference of corner places, relative to the board's size in the picture, below which two views
-count as the same [1]."""
+"""Distance between common corners, relative to the board's size in the image, up to which two views
+count as the same [1], see `_difference`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture, and the file that it was read from."""
+    """An image, and the file that it was read from."""
 
     path: Path
     image: np.ndarray
@@ -52,13 +52,13 @@ class Picture:
 
 
 def named_pictures(words: Sequence[str]) -> list[Path]:
-    """Return the picture files that command-line words name, each once, in the words' order.
+    """Return the image files given by command-line words, each once, in the words' order.
 
     Args:
         words: files, folders and glob patterns.
 
     Raises:
-        DataError: a word names no picture.
+        DataError: a folder contains no image, or no file matches a pattern.
     """
     named: dict[Path, None] = {}
     for word in words:
@@ -70,7 +70,7 @@ def named_pictures(words: Sequence[str]) -> list[Path]:
         else:
             files = sorted(Path(p) for p in glob.glob(word, recursive=True) if Path(p).is_file())
             if not files:
-                raise DataError(f"{word}: no file has such a name; expected pictures")
+                raise DataError(f"{word}: no file matches this pattern; expected image files")
         named.update(dict.fromkeys(files))
     return list(named)
 
@@ -79,14 +79,14 @@ def named_pictures(words: Sequence[str]) -> list[Path]:
 class Board:
     """A chessboard with markers in its white squares, printed flat.
 
-    Its own axes start at the upper left corner of its first square: x right, y down.
+    The board's axes start at the upper left corner of its first square: x right, y down.
 
     Attributes:
         columns, rows: number of squares along x and along y.
         square_m, marker_m: edge length of a square and of a marker [m].
         dictionary: dictionary of its markers, such as `4X4_50`.
-        legacy: True if it was drawn by OpenCV before 4.6, which began boards of an even number of
-            rows with a white square.
+        legacy: True if the board was drawn by OpenCV before 4.6, which began boards with an even
+            number of rows with a white square.
     """
 
     columns: int
@@ -109,7 +109,7 @@ class Board:
         if needed > available:
             raise DataError(
                 f"a board of {self.size} squares has {needed} markers, but dictionary "
-                f"{self.dictionary} has {available}; expected a larger one, such as 4X4_250"
+                f"{self.dictionary} has {available}; expected a larger dictionary, such as 4X4_250"
             )
 
     @property
@@ -142,13 +142,13 @@ class Board:
     def on_floor(
         self, board_m: Float[np.ndarray, "corner 2"], height_m: float
     ) -> Float[np.ndarray, "corner 3"]:
-        """Return places of corners in a world whose origin is below the board's middle [m].
+        """Return positions of corners in a world whose origin is below the board's middle [m].
 
         The origin is on the floor. With the board seen from above, x points to its right, y to its
         upper edge, and z up.
 
         Args:
-            board_m: corners in the board's own axes [m].
+            board_m: corners in the board's axes [m].
             height_m: height of the board's printed face above the floor [m].
         """
         middle = 0.5 * self.square_m * np.array([self.columns, self.rows])
@@ -158,12 +158,12 @@ class Board:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Corners of a board detected in one picture.
+    """Corners of a board detected in one image.
 
     Attributes:
-        name: name of the picture.
-        pixels: places of the corners in the picture [pixel].
-        board_m: places of the corners on the board [m].
+        name: name of the image.
+        pixels: x and y of the corners in the image [pixel].
+        board_m: x and y of the same corners in the board's axes [m].
     """
 
     name: str
@@ -171,12 +171,12 @@ class View:
     board_m: Float[np.ndarray, "corner 2"]
 
     def only(self, kept: np.ndarray) -> "View":
-        """Return a view with only some of the corners, chosen by a mask or by indices."""
+        """Return the view with only the corners that a mask or indices select."""
         return View(self.name, self.pixels[kept], self.board_m[kept])
 
     @property
     def flat(self) -> bool:
-        """True if its corners do not determine the board's pose: too few, or all near one line."""
+        """True if the corners do not determine the board's pose: too few, or all near one line."""
         if len(self.pixels) < LEAST_CORNERS:
             return True
         steps = np.unique(np.round(np.diff(np.unique(self.board_m)), 9))
@@ -188,16 +188,16 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
     """Return a board whose size is given as text such as `7x5`: columns and rows of squares.
 
     Raises:
-        DataError: the size is not such a text, or no such board is possible.
+        DataError: the text does not have this form, or no board can have these sizes.
     """
     columns, by, rows = size.lower().partition("x")
     if not (by and columns.strip().isdecimal() and rows.strip().isdecimal()):
-        raise DataError(f"--board {size}; expected squares along x and y, such as 7x5")
+        raise DataError(f"--board {size}; expected the numbers of squares along x and y, as in 7x5")
     return Board(int(columns), int(rows), square_m, marker_m, dictionary, legacy)
 
 
 def view_of(board: Board, picture: Picture) -> View:
-    """Return the corners of the board in a picture; the view is empty if it is not detected."""
+    """Return the corners of the board in an image; the view is empty if it is not detected."""
     detector = cv2.aruco.CharucoDetector(board.pattern)
     pixels, numbers = detector.detectBoard(picture.image)[:2]
     if numbers is None:
@@ -207,17 +207,17 @@ def view_of(board: Board, picture: Picture) -> View:
 
 
 def usable(board: Board, pictures: Sequence[Picture]) -> tuple[list[View], list[str]]:
-    """Return the usable views of a board in pictures of one size, and sentences about the others.
+    """Return the usable views of a board in images of one size, and sentences on unusable views.
 
     Raises:
-        DataError: the pictures differ in size, or the board is detected in too few of them.
+        DataError: the images differ in size, or the board is detected in too few of them.
     """
     for other in pictures[1:]:
         if other.image_px != pictures[0].image_px:
             (w, h), (width, height) = pictures[0].image_px, other.image_px
             raise DataError(
                 f"{other.path}: {width} x {height} pixels, but {pictures[0].path} has {w} x {h}; "
-                "expected pictures of one camera at one resolution"
+                "expected images of one camera at one resolution"
             )
     views = [view_of(board, picture) for picture in pictures]
     if not any(len(view.pixels) for view in views):
@@ -225,7 +225,7 @@ def usable(board: Board, pictures: Sequence[Picture]) -> tuple[list[View], list[
     left_out = [
         f"view {v.name} left out: {len(v.pixels)} corners"
         + (" near one line" if len(v.pixels) >= LEAST_CORNERS else "")
-        + f"; expected {LEAST_CORNERS} or more, not all on a line"
+        + f"; expected {LEAST_CORNERS} corners or more, not all on a line"
         for v in views
         if v.flat
     ]
@@ -235,15 +235,15 @@ def usable(board: Board, pictures: Sequence[Picture]) -> tuple[list[View], list[
 
 
 def check_enough(views: Sequence[View]) -> None:
-    """Check that there are enough views that differ.
+    """Check that there are enough views, and enough that differ from each other.
 
     Raises:
-        DataError: there are too few views, or too few that differ.
+        DataError: there are too few views, or too few that differ from each other.
     """
     if len(views) < LEAST_VIEWS:
         raise DataError(
             f"{len(views)} usable views of the board; expected {LEAST_VIEWS} at the very least, "
-            "better 15: take more pictures, at every edge and corner of the picture and tilted"
+            "better 15: take more images, at every edge and corner of the image and tilted"
         )
     distinct: list[View] = []
     for view in views:
@@ -251,17 +251,17 @@ def check_enough(views: Sequence[View]) -> None:
             distinct.append(view)
     if len(distinct) < LEAST_VIEWS:
         raise DataError(
-            f"only {len(distinct)} of {len(views)} views differ: in the others the board is where "
-            f"it was before; expected {LEAST_VIEWS} or more views that differ: move the board over "
-            "the whole picture and tilt it"
+            f"only {len(distinct)} of {len(views)} views differ: the others show the board where "
+            f"another view shows it; expected {LEAST_VIEWS} or more views that differ: move the "
+            "board over the whole image and tilt it"
         )
 
 
 def _difference(view: View, other: View) -> float:
-    """Return the difference of two views: the distance between common corners in the pictures [1].
+    """Return how far common corners of two views lie apart, relative to the corners' spread [1].
 
-    It is relative to the distance of the corners from their middle, and infinite if two views have
-    too few common corners.
+    Distance and spread are root mean squares over the common corners [pixel]; the spread is about
+    the corners' middle. The difference is infinite if the views have too few common corners.
     """
     first, second = (np.round(v.board_m, 6) @ [1, 1j] for v in (view, other))
     common, in_view, in_other = np.intersect1d(first, second, return_indices=True)
@@ -272,16 +272,16 @@ def _difference(view: View, other: View) -> float:
 
 
 def not_detected(board: Board, pictures: Sequence[Picture]) -> DataError:
-    """Return the error to raise if no picture shows the board; its message says what they show."""
+    """Return the error to raise if no image shows the board; its message says what images show."""
     if len(pictures) == 1:
         where = f"{pictures[0].path}: the board is not found in it"
     else:
-        where = f"{pictures[0].path} and {len(pictures) - 1} more: the board is found in none"
+        where = f"{pictures[0].path} and {len(pictures) - 1} more: the board is in none of them"
     return DataError(f"{where}; looked for {board}; {_advice(board, pictures[:SEARCHED_PICTURES])}")
 
 
 def _advice(board: Board, pictures: Sequence[Picture]) -> str:
-    """Return what markers pictures show although the board is not detected, with a remedy."""
+    """Return a sentence on the markers that images show instead of the board, with a remedy."""
     if other := _other_board(board, board.dictionary, pictures):
         return other
     name, numbers = visible_markers([picture.image for picture in pictures])
@@ -290,19 +290,22 @@ def _advice(board: Board, pictures: Sequence[Picture]) -> str:
     if len(numbers) < ENOUGH_DETECTIONS:
         return (
             "and found no markers of any dictionary: expected a board that is sharp, evenly lit, "
-            "not mirrored, and large enough that a marker has 20 pixels or more"
+            "not mirrored, and so large that a marker is 20 pixels wide or more"
         )
-    remedy = f"say --dictionary {name} and the board's true size"
+    remedy = f"use --dictionary {name} and the board's true size"
     if name == board.dictionary:
-        remedy = "expected another size in squares, or a board of other numbers"
+        remedy = (
+            f"expected another --board size, or a board whose markers are numbered from 0 to "
+            f"{board.columns * board.rows // 2 - 1}"
+        )
     return (
-        f"but {len(numbers)} markers of {name} are there, numbers {numbers[0]} to "
+        f"but found {len(numbers)} markers of {name} with numbers from {numbers[0]} to "
         f"{numbers[-1]}: {remedy}"
     )
 
 
 def _other_board(board: Board, dictionary: str, pictures: Sequence[Picture]) -> str | None:
-    """Return advice if pictures show a similar board with markers of a dictionary, else None.
+    """Return advice if images show a similar board with this dictionary's markers, else None.
 
     A similar board may have rows and columns swapped, the other legacy pattern, or both.
     """
@@ -315,7 +318,7 @@ def _other_board(board: Board, dictionary: str, pictures: Sequence[Picture]) -> 
         if corners >= ENOUGH_DETECTIONS:
             option = "--legacy" if legacy else "without --legacy"
             return (
-                f"but {corners} corners of this one are: {other}; say --board {other.size} "
+                f"but found {corners} corners of a board of {other}; use --board {other.size} "
                 f"--dictionary {dictionary} {option}"
             )
     return None

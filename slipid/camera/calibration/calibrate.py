@@ -1,4 +1,4 @@
-"""Camera calibration from pictures and points to a camera with its report."""
+"""Camera calibration as a whole: from images of a board and measured points to a camera file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +34,8 @@ class CalibratedLens:
     Attributes:
         lens: the lens.
         report: report of its calibration.
-        covariance: covariance of its parameters, in the order of `NAMES`; None if it is not known.
+        covariance: covariance of the lens's parameters, in the order of
+            `slipid.camera.calibration.lens.NAMES`; None if it is not known.
         quality: the fit of the lens and its quality; None if the lens was read from a file.
     """
 
@@ -44,20 +45,20 @@ class CalibratedLens:
     quality: Quality | None = None
 
     def to_json(self) -> Content:
-        """Return the content of a camera file without a floor."""
+        """Return the content of a camera file without a pose above the floor."""
         return self.lens.to_json() | {"report": self.report}
 
 
 def lens_from_pictures(words: Sequence[str], board: Board, k3: bool) -> CalibratedLens:
-    """Return a lens calibrated with pictures of a board.
+    """Return a lens calibrated with images of a board.
 
     Args:
-        words: files, folders and glob patterns of pictures.
+        words: files, folders and glob patterns of images.
         board: the board.
         k3: whether the distortion parameter k3 is fitted too.
 
     Raises:
-        DataError: a file is not a picture, or the views do not determine a lens.
+        DataError: a file is not an image, or the views do not determine a lens.
     """
     pictures = [Picture(path, read_picture(path)) for path in named_pictures(words)]
     views, left_out = usable(board, pictures)
@@ -84,7 +85,7 @@ def lens_from_file(path: Path) -> CalibratedLens:
 def _covariance(lens: Content, count: int) -> Float[np.ndarray, "parameter parameter"] | None:
     """Return the covariance in a lens report, or None if it is absent or invalid.
 
-    Another program may have written the report.
+    The values are checked, since another program may have written the report.
     """
     try:
         covariance = np.array(lens.get("covariance"), float)
@@ -95,16 +96,16 @@ def _covariance(lens: Content, count: int) -> Float[np.ndarray, "parameter param
 
 
 def on_board(lens: CalibratedLens, board: Board, picture: Path, height_m: float) -> FloorPoints:
-    """Return the corners of a board that lies on the floor.
+    """Return the corners of a board that lies on the floor, as points of world and image.
 
     Args:
         lens: the camera's lens.
         board: the board.
-        picture: file of the picture that shows it.
+        picture: file of the image that shows the board.
         height_m: height of the board's printed face above the floor [m].
 
     Raises:
-        DataError: the picture's size differs from the lens's, or too few corners are detected.
+        DataError: the image's size differs from the lens's, or too few corners are detected.
     """
     taken = Picture(picture, read_picture(picture))
     lens.lens.check_size(taken.image_px, picture)
@@ -114,7 +115,7 @@ def on_board(lens: CalibratedLens, board: Board, picture: Path, height_m: float)
     if view.flat:
         raise DataError(
             f"{picture}: {len(view.pixels)} corners of the board; expected {LEAST_CORNERS} or "
-            "more, not all on a line: the whole board, sharp and evenly lit"
+            "more, not all on a line: show the whole board, sharp and evenly lit"
         )
     names = tuple(f"corner {k}" for k in range(1, len(view.pixels) + 1))
     return FloorPoints(names, view.pixels, board.on_floor(view.board_m, height_m))
@@ -123,12 +124,12 @@ def on_board(lens: CalibratedLens, board: Board, picture: Path, height_m: float)
 def floor_from_board(
     lens: CalibratedLens, board: Board, picture: Path, height_m: float, size_std: float
 ) -> FloorFit:
-    """Return a camera's place, fitted to a board that lies on the floor.
+    """Return a camera's pose above the floor, fitted to a board that lies on the floor.
 
     Args:
         lens: the camera's lens.
         board: the board.
-        picture: file of the picture that shows it.
+        picture: file of the image that shows the board.
         height_m: height of the board's printed face above the floor [m].
         size_std: relative std of the board's size [1].
     """
@@ -137,7 +138,7 @@ def floor_from_board(
 
 
 def floor_from_points(lens: CalibratedLens, path: Path, size_std: float) -> FloorFit:
-    """Return a camera's place, fitted to the measured points in a file.
+    """Return a camera's pose above the floor, fitted to the measured points in a file.
 
     `size_std` is the relative std of the measuring tape's scale [1].
     """
@@ -148,10 +149,10 @@ def floor_from_points(lens: CalibratedLens, path: Path, size_std: float) -> Floo
 def straight_camera(
     picture: Path, metres_per_pixel: float, height_m: float, turn_deg: float, size_std: float | None
 ) -> OverheadCamera:
-    """Return an uncalibrated camera that looks straight down, for pictures of this one's size.
+    """Return an uncalibrated camera that looks straight down, with the size of a given image.
 
-    Other arguments are those of `OverheadCamera.straight_down`; `size_std` is the relative std of
-    lengths on the floor [1], None if it is not known.
+    `size_std` is the relative std of lengths on the floor [1], None if it is not known. The other
+    arguments are those of `OverheadCamera.straight_down`.
     """
     image_px = size_of(read_picture(picture))
     camera = OverheadCamera.straight_down(image_px, metres_per_pixel, height_m, turn_deg)

@@ -1,6 +1,6 @@
 """The lens fitted to views of the board, with the covariance of its parameters.
 
-Views and corners that do not fit the others are excluded and listed.
+Views and corners that are inconsistent with the others are excluded and listed.
 """
 
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ MOST_ROUNDS = 30
 VIEW_RATIO = 3.0
 """Ratio of a view's median residual to that of all views above which the view is excluded [1]."""
 CORNER_RATIO = 6.0
-"""Ratio of a corner's residual to the median one above which it is excluded [1]. Noise alone
-exceeds it for one corner in 10^7."""
+"""Ratio of a corner's residual to the median residual above which the corner is excluded [1]. Pure
+noise exceeds it for one corner in 10^7."""
 HARMLESS_PX = 0.3
-"""Residual below which no view or corner is excluded, since it is harmless [pixel]."""
+"""Residual up to which views and corners are never excluded, since it is harmless [pixel]."""
 MOST_VIEWS_EXCLUDED = 0.25
-"""Largest fraction of the views that may be excluded; if more do not fit, it is not clear which
-ones are right [1]."""
+"""Largest fraction of the views that may be excluded [1]; if more views are inconsistent with the
+others, it is not clear which ones are right."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,8 @@ class Projection:
 
     Attributes:
         pixels: u, v of each point [pixel].
-        by_pose: derivatives by turn [pixel/rad] and shift [pixel/m] of the pose.
-        by_lens: derivatives by the parameters of the lens, in the order of NAMES.
+        by_pose: derivatives with respect to the pose's turn [pixel/rad] and shift [pixel/m].
+        by_lens: derivatives with respect to the lens's parameters, in the order of NAMES.
     """
 
     pixels: Float[np.ndarray, "point 2"]
@@ -68,10 +68,10 @@ class LensFit:
 
     Attributes:
         lens: the lens.
-        covariance: covariance of its parameters, in the order of NAMES.
-        views: views with the corners that it was fitted to.
+        covariance: covariance of the lens's parameters, in the order of NAMES.
+        views: views with the corners that the lens was fitted to.
         poses: pose of the board in each view.
-        residuals: measured less computed places of the corners, by view [pixel].
+        residuals: measured less computed pixels of the corners, one array for each view [pixel].
         left_out: sentences about views and corners that were excluded.
     """
 
@@ -105,7 +105,7 @@ def parameters_of(lens: Lens) -> Float[np.ndarray, " parameter"]:
 
 
 def lens_of(lens: Lens, parameters: Float[np.ndarray, " parameter"]) -> Lens:
-    """Return a lens with new parameters, in the order of NAMES, and the image size of another."""
+    """Return a lens with new parameters, in the order of NAMES, and the given lens's image size."""
     fx, fy, cx, cy = parameters[:4]
     return Lens(lens.image_px, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), parameters[4:])
 
@@ -141,7 +141,7 @@ def fit_lens(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> Lens
     poses = [Pose(np.ravel(r), np.ravel(t)) for r, t in zip(fit[3], fit[4], strict=True)]
     finite = np.isfinite(np.concatenate([parameters_of(lens), *(pose.shift for pose in poses)]))
     if not finite.all():
-        raise indeterminate("the fit of the lens diverges")
+        raise indeterminate("the lens parameters diverge in the fit")
     return _with_covariance(lens, list(views), poses)
 
 
@@ -160,9 +160,9 @@ def solid(view: View) -> Float[np.ndarray, "corner 3"]:
 
 
 def _with_covariance(lens: Lens, views: list[View], poses: list[Pose]) -> LensFit:
-    """Return a fit with the covariance of its lens.
+    """Return a fit of a lens with residuals and the covariance of the lens's parameters.
 
-    The board's pose is eliminated from the normal equations view by view.
+    The board's pose in each view is eliminated from the normal equations by a Schur complement.
     """
     information, residuals = np.zeros((len(parameters_of(lens)),) * 2), []
     for view, pose in zip(views, poses, strict=True):
@@ -192,12 +192,12 @@ def pose_of(lens: Lens, view: View) -> Pose:
 
 
 def fit_robustly(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> LensFit:
-    """Return a lens fitted without the views and corners that do not fit the others.
+    """Return a lens fitted without the views and corners that are inconsistent with the others.
 
     The fit is repeated until nothing more is excluded.
 
     Raises:
-        DataError: too many views do not fit the others, or too few views remain.
+        DataError: too many views are inconsistent with the others, or too few views remain.
     """
     now, left_out, first = list(views), [], len(views)
     for _ in range(MOST_ROUNDS):
@@ -214,13 +214,13 @@ def fit_robustly(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> 
             del now[worst]
             if first - len(now) > MOST_VIEWS_EXCLUDED * first:
                 raise DataError(
-                    f"{first - len(now)} of {first} views do not fit the others ({now[0].name} "
-                    "does); expected a flat board of known size, sharp pictures, and one camera "
-                    "whose focus and zoom stayed"
+                    f"{first - len(now)} of {first} views are inconsistent with the others "
+                    f"({now[0].name} is consistent); expected a flat board of known size, sharp "
+                    "images, and one camera with fixed focus and zoom"
                 )
             check_enough(now)
             continue
-        # exclude only the worst corner of a view: the others may be off because of it
+        # exclude only the worst corner of each view: it may distort the residuals of the others
         limit = max(CORNER_RATIO * level, HARMLESS_PX)
         bad = [(one > limit) & (one == one.max()) for one in off]
         if not any(b.any() for b in bad):

@@ -1,4 +1,4 @@
-"""The place of a camera with a known lens above a floor, fitted to points, and its uncertainty."""
+"""The pose of a camera with a known lens above a floor, fitted to points, and its uncertainty."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,38 +14,39 @@ from slipid.support.errors import DataError
 
 FLAT_M = 1e-9
 AGREEMENT = 0.3
-"""Ratio of the error without a point to the error with it, below which that point is bad [1]."""
+"""Ratio of the fit's error without a point to its error with all points, below which that point
+counts as bad [1]."""
 LEAST_BAD_PX = 1.5
 LEAST_TO_DROP = 6
 LEAST_TO_TEST = 5
-"""Number of points below which the fit cannot show which of them is bad."""
+"""Number of points below which the fit cannot show which point is bad."""
 MOST_POINTS_EXCLUDED = 0.25
 """Largest fraction of the points that may be excluded [1]."""
 TWIN_RATIO = 2.0
-"""Ratio of the errors of two poses below which the points do not clearly decide between them
+"""Ratio of the errors of two poses below which the points do not clearly decide between the poses
 [1]."""
 LEAST_STD_PX = 0.03
-"""Smallest std assumed for the error of a point [pixel], since few points may by chance fit better
-than corners can be detected."""
+"""Smallest std assumed for the error of a point [pixel]; the residuals of few points may by chance
+be smaller than the accuracy of a detected corner."""
 STEP_IN_STDS = 0.01
 """Step of numerical derivatives, in stds of the variable [1]."""
 GRID_POINTS = 5
 INNER_SHARE = 0.8
-"""Fraction of the picture's width and height in which lengths on the floor are compared [1]."""
+"""Fraction of the image's width and height in which lengths on the floor are compared [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FloorFit:
-    """A camera's place, and the points that it was fitted to.
+    """A camera's pose above the floor, and the points that it was fitted to.
 
     Attributes:
-        camera: the lens at its fitted place.
+        camera: the lens at its fitted pose.
         pose: pose of the world in the camera's axes.
-        points: points that the place was fitted to.
+        points: points that the pose was fitted to.
         twin_px: root mean square error of the next best pose that also looks down [pixel]; None if
             there is none.
-        left_out: sentences about points that do not fit.
-        disputed: True if some points that do not fit could not be excluded from the fit.
+        left_out: sentences about points that contradict the others.
+        disputed: True if the points contradict each other, but too few remain to exclude one.
     """
 
     camera: OverheadCamera
@@ -57,7 +58,7 @@ class FloorFit:
 
     @cached_property
     def residuals(self) -> Float[np.ndarray, "point 2"]:
-        """Measured less computed places of the points in the picture [pixel]."""
+        """Measured less computed pixels of the points [pixel]."""
         now = project(self.camera.lens, self.pose, self.points.places)
         return self.points.pixels - now.pixels
 
@@ -77,32 +78,32 @@ class FloorFit:
 
 
 def camera_of(lens: Lens, pose: Pose) -> OverheadCamera:
-    """Return the camera with this lens, given the pose of the world in the camera's axes."""
+    """Return the camera with a lens and the pose of the world in the camera's axes."""
     rotation = pose.rotation
     return OverheadCamera(lens, rotation, -rotation.T @ pose.shift)
 
 
 def fit_place(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
-    """Return the place of the camera, fitted to all points.
+    """Return the pose of the camera, fitted to all points.
 
     Raises:
-        DataError: no place of a camera above the floor explains the points.
+        DataError: no camera pose above the floor explains the points.
     """
     fit = _fitted(lens, points)
     if fit is None:
         raise DataError(
-            f"{source}: no camera that is above the floor and looks down sees these points so; "
-            "expected x and y in metres, right-handed seen from above (y to the left of x), u to "
-            "the right and v down, and a camera that looks down"
+            f"{source}: no camera above the floor that looks down would see these points at these "
+            "pixels; expected x and y in metres, right-handed seen from above (y to the left of "
+            "x), u to the right, and v down"
         )
     return fit
 
 
 def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
-    """Return the place of the camera, fitted without points that clearly contradict the others.
+    """Return the pose of the camera, fitted without points that clearly contradict the others.
 
     Raises:
-        DataError: no place of a camera above the floor explains the points.
+        DataError: no camera pose above the floor explains the points.
     """
     left_out: tuple[str, ...] = ()
     first = len(points.names)
@@ -113,7 +114,9 @@ def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit
             return replace(fit_place(source, lens, points), left_out=left_out)
         index, sentence = bad
         if len(points.names) < fewest:
-            doubt = f"{sentence}; it was NOT left out, for the points are too few: measure again"
+            doubt = (
+                f"{sentence}; it was NOT left out, because there are too few points: measure again"
+            )
             fit = _fitted(lens, points)
             if fit is None:
                 raise DataError(f"{source}: {doubt}")
@@ -126,15 +129,15 @@ def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit
         left_out = (
             *left_out,
             f"the points are off by {fit.rms_px:.1f} pixels; with {len(points.names)} points "
-            "nobody can tell which is bad: measure again, better 8 points",
+            "it is not possible to tell which one is bad: measure again, preferably 8 points",
         )
     return replace(fit, left_out=left_out, disputed=vague)
 
 
 def _bad_point(lens: Lens, points: FloorPoints) -> tuple[int, str] | None:
-    """Return the point without which the others agree far better; None if there is none.
+    """Return index of the point without which the others agree far better, with a sentence on it.
 
-    It is given by its index, with a sentence about it.
+    The result is None if there is no such point.
     """
     fit = _fitted(lens, points)
     without = [_fitted(lens, points.without(k)) for k in range(len(points.names))]
@@ -142,7 +145,8 @@ def _bad_point(lens: Lens, points: FloorPoints) -> tuple[int, str] | None:
     if not agreed:
         return None
     error, index, rest = min(agreed, key=lambda one: one[:2])
-    # one bad point may be so far off that no place of a camera explains all points
+    # without a fit to all points (one may be so far off that no camera pose explains them all),
+    # the rest must be accurate by itself
     limit = LEAST_BAD_PX if fit is None else AGREEMENT * fit.rms_px
     one = replace(rest, points=points.only([index]))
     if not (error < limit and one.rms_px > LEAST_BAD_PX):
@@ -154,12 +158,13 @@ def _bad_point(lens: Lens, points: FloorPoints) -> tuple[int, str] | None:
 
 
 def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
-    """Return the best place above the floor; None if no such place explains the points."""
+    """Return the best camera pose above the floor; None if no such pose explains the points."""
     poses = _candidates(lens, points)
     fits = [FloorFit(camera_of(lens, pose), pose, points) for pose in poses]
     fits.sort(key=lambda fit: fit.rms_px)
     above = [fit for fit in fits if fit.camera.place[2] > 0 and fit.camera.rotation[2, 2] < 0]
-    # of two poses with similar errors, choose the one above the floor if its error is acceptable
+    # the best pose of all may lie below the floor: accept one above it if its error is similar or
+    # small
     if not above or above[0].rms_px > max(TWIN_RATIO * fits[0].rms_px, LEAST_BAD_PX):
         return None
     best, *others = above
@@ -168,9 +173,10 @@ def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
 
 
 def _candidates(lens: Lens, points: FloorPoints) -> list[Pose]:
-    """Return poses that are local minima of the error; points in a plane have two of them."""
+    """Return the poses at local minima of the error; points in a plane have two such poses."""
     middle = points.places.mean(0)
-    # OpenCV recognises points in a plane only if their z is 0; centred numbers are most precise
+    # subtract the mean: OpenCV recognises points in a plane only if their z is 0, and centred
+    # coordinates lose the least precision
     places = np.ascontiguousarray(points.places - middle).reshape(-1, 1, 3)
     pixels = np.ascontiguousarray(points.pixels).reshape(-1, 1, 2)
     given = (places, pixels, lens.matrix, lens.distortion)
@@ -192,11 +198,11 @@ def _differ(pose: Pose, other: Pose) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PlaceUncertainty:
-    """Uncertainty of a camera's place.
+    """Uncertainty of a camera's pose above the floor.
 
     Attributes:
         pose: covariance of turn [rad] and shift [m], including the lens's uncertainty.
-        place_std_m: std of the lens's place in the world [m].
+        place_std_m: std of the lens's position in the world [m].
         tilt_std_deg: std of the angle between the lens's axis and straight down [deg].
         scale_std: relative std of lengths on the floor if the board's size were exact [1].
     """
@@ -215,10 +221,10 @@ def tilt_deg(camera: OverheadCamera) -> float:
 def uncertainty(
     fit: FloorFit, of_lens: Float[np.ndarray, "parameter parameter"] | None
 ) -> PlaceUncertainty:
-    """Return the uncertainty of a camera's place.
+    """Return the uncertainty of a camera's pose above the floor.
 
     Args:
-        fit: the fit of the place; the variance of the points' errors is that of its residuals.
+        fit: the fit of the pose; its residuals give the variance of the points' errors.
         of_lens: covariance of the lens's parameters; None if it is not known.
     """
     lens = fit.camera.lens
@@ -227,7 +233,7 @@ def uncertainty(
 
     def derived(values: np.ndarray) -> np.ndarray:
         camera = camera_of(lens_of(lens, values[6:]), Pose(values[:3], values[3:6]))
-        # the axis's direction, since the angle is not differentiable at straight down
+        # use the axis's direction instead of the tilt, which is not differentiable at straight down
         return np.array([*camera.place, *camera.rotation[2, :2], _log_length(camera)])
 
     steps = np.diag(np.maximum(STEP_IN_STDS * np.sqrt(np.diag(joint)), 1e-9))
@@ -246,7 +252,7 @@ def _joint(
 ) -> Float[np.ndarray, "all all"]:
     """Return the joint covariance of pose and lens.
 
-    They are correlated, since an error of the lens changes the pose that is fitted with it.
+    Pose and lens are correlated, since an error of the lens changes the pose fitted with that lens.
     """
     now = project(fit.camera.lens, fit.pose, fit.points.places)
     free = max(fit.residuals.size - 6, 1)
@@ -260,7 +266,10 @@ def _joint(
 
 
 def _log_length(camera: OverheadCamera) -> float:
-    """Return the mean logarithm of the floor lengths [m] between neighbours in a grid of pixels."""
+    """Return the mean logarithm of the distances [m] on the floor between neighbouring grid pixels.
+
+    Its std is the relative std of lengths on the floor.
+    """
     width, height = camera.lens.image_px
     part = 0.5 + INNER_SHARE * np.linspace(-0.5, 0.5, GRID_POINTS)
     grid = np.stack(np.meshgrid(part * (width - 1), part * (height - 1)), axis=-1)

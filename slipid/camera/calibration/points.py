@@ -1,4 +1,4 @@
-"""Measured points on the floor, read from a CSV file of their places in world and picture."""
+"""Measured points on the floor, read from a CSV file of their pixels and world coordinates."""
 
 import math
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ as lying on one line [1]."""
 
 @dataclass(frozen=True, eq=False)
 class FloorPoints:
-    """Places in the world, and the pixels at which they appear.
+    """Points in the world, and the pixels at which they appear.
 
     The world is right-handed with z up: seen from above, y lies to the left of x.
 
     Attributes:
         names: name of each point.
-        pixels: places of the points in the picture [pixel].
+        pixels: u, v of the points in the image [pixel].
         places: x, y, z of the points in the world [m].
     """
 
@@ -48,8 +48,8 @@ def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
     """Return the points in a CSV file with columns u, v [pixel], x, y and optionally z [m].
 
     Raises:
-        DataError: the file is absent, lacks a column, has a cell that is not a number or a pixel
-            outside the picture; or the points do not determine the camera's place.
+        DataError: the file is absent, lacks a column, or has a cell that is not a number or a pixel
+            outside the image; or the points do not determine the camera's pose.
     """
     rows = [row for row in csv_rows(path, f"a CSV file with columns {EXPECTED}") if any(row[1])]
     if not rows:
@@ -71,8 +71,8 @@ def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
         raise bad_data(
             path,
             f"u = {u:g}, v = {v:g}",
-            f"pixels inside the camera's picture of {image_px[0]} x {image_px[1]}; if the points "
-            "were read off another picture, take one at the same resolution",
+            f"pixels inside the camera's image of {image_px[0]} x {image_px[1]}; if the points "
+            "were read off an image of another size, take one at this resolution",
             row=rows[k][0],
         )
     check_spread(path, points)
@@ -80,22 +80,22 @@ def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
 
 
 def check_spread(source: Path, points: FloorPoints) -> None:
-    """Raise `DataError` unless points determine a camera's place.
+    """Raise `DataError` unless points determine a camera's pose.
 
     Raises:
         DataError: the points are too few, or lie on one line.
     """
     if len(points.names) < LEAST_POINTS:
         raise DataError(
-            f"{source}: {len(points.names)} points; expected {LEAST_POINTS} or more, better 8, all "
-            "over the floor"
+            f"{source}: {len(points.names)} points; expected {LEAST_POINTS} or more, preferably 8, "
+            "all over the floor"
         )
-    for where, at in (("on the floor", points.places), ("in the picture", points.pixels)):
+    for where, at in (("on the floor", points.places), ("in the image", points.pixels)):
         spread = np.linalg.svd(at - at.mean(0), compute_uv=False)
         if spread[1] <= LINE_WIDTH * spread[0]:
             raise DataError(
                 f"{source}: all {len(points.names)} points lie on one line {where}; expected some "
-                "well beside it"
+                "points far from that line"
             )
 
 

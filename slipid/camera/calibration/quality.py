@@ -1,4 +1,4 @@
-"""Quality of a calibrated lens: coverage of the picture, accuracy, and error on held-out views."""
+"""Quality of a calibrated lens: coverage of the image, accuracy, and error on held-out views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ TILTED_DEG = 12.0
 """Tilt of the board above which a view separates focal length and distance [deg]."""
 LEAST_TILTED = 3
 CELLS = (8, 6)
-"""Numbers of cells across and down into which the picture is divided, to measure coverage."""
+"""Numbers of cells across and down into which the image is divided, to measure coverage."""
 REFUSED_SHARE, POOR_SHARE = 0.35, 0.6
 """Fraction of the cells with corners below which a lens is refused, and below which it is reported
 as poor [1]."""
@@ -40,12 +40,12 @@ POOR_VIEWS = 10
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Coverage of the picture by corners of the board.
+    """Coverage of the image by corners of the board.
 
     Attributes:
-        visited: cells of the picture that contain corners, beginning at the upper left.
-        reach: how near board corners come to each of the picture's four corners, as a fraction of
-            the distance from the picture's middle; the smallest of the four values [1].
+        visited: cells of the image that contain corners, beginning at the upper left.
+        reach: how near board corners come to each of the image's four corners, as a fraction of
+            the distance from the image's middle; the smallest of the four values [1].
     """
 
     visited: Bool[np.ndarray, "down across"]
@@ -53,16 +53,16 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Fraction of the picture's cells that contain corners [1]."""
+        """Fraction of the image's cells that contain corners [1]."""
         return float(self.visited.mean())
 
 
 def coverage(pixels: Float[np.ndarray, "corner 2"], image_px: tuple[int, int]) -> Coverage:
-    """Return the coverage of a picture by corners."""
+    """Return the coverage of an image by corners."""
     size = np.array(image_px)
     visited = np.histogramdd(pixels, CELLS, [(-0.5, n - 0.5) for n in image_px])[0].T > 0
     from_middle = (pixels - (size - 1) / 2) / (size / 2)
-    # the smaller of the shares in x and y counts: the middle of an edge is near no picture corner
+    # the smaller of the fractions in x and y counts, since the middle of an edge is near no corner
     reach = min(float((from_middle * one).min(1).max()) for one in product((1, -1), repeat=2))
     return Coverage(visited, max(reach, 0.0))
 
@@ -74,7 +74,7 @@ class Quality:
     Attributes:
         fit: the fit of the lens.
         held_out_px: root mean square error on views that the lens was not fitted to [pixel].
-        coverage: coverage of the picture.
+        coverage: coverage of the image.
         tilts_deg: angle between board and sensor in each view [deg].
         poor: sentences about shortcomings and their remedies.
     """
@@ -87,10 +87,10 @@ class Quality:
 
 
 def quality_of(fit: LensFit, k3: bool) -> Quality:
-    """Return the quality of a fit.
+    """Return the quality of a fitted lens.
 
     Raises:
-        DataError: the lens is too bad to be used.
+        DataError: the views do not determine the lens well enough, see `check_usable`.
     """
     covered = coverage(np.concatenate([v.pixels for v in fit.views]), fit.lens.image_px)
     cosines = np.array([abs(pose.rotation[2, 2]) for pose in fit.poses])
@@ -117,17 +117,17 @@ def check_usable(fit: LensFit, covered: Coverage, tilts: Float[np.ndarray, " vie
         raise indeterminate(f"the focal length is known only to {100 * focal:.1f} %")
     if covered.share < REFUSED_SHARE:
         raise DataError(
-            f"corners in {100 * covered.share:.0f} % of the picture's {covered.visited.size} "
-            f"cells; expected {100 * POOR_SHARE:.0f} % or more, for distortion is not known where "
-            "no corner was: move the board to every edge and corner of the picture"
+            f"corners in {100 * covered.share:.0f} % of the image's {covered.visited.size} "
+            f"cells; expected {100 * POOR_SHARE:.0f} % or more, since distortion is unknown where "
+            "no corner was: move the board to every edge and corner of the image"
         )
 
 
 def held_out_px(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> float:
     """Return the root mean square error on views that the lens was not fitted to [pixel].
 
-    The board's pose in each of these views is fitted with the lens fixed. Its six parameters reduce
-    the error, which is scaled up to compensate.
+    The board's pose in each of these views is fitted with the lens fixed. The six parameters of the
+    pose reduce the error, so it is scaled up by the lost degrees of freedom.
     """
     squares, count = 0.0, 0
     for fold in range(HELD_OUT_FOLDS):
@@ -149,16 +149,17 @@ def _poor(fit: LensFit, covered: Coverage, held_out: float) -> list[str]:
     """Return sentences about shortcomings of a lens."""
     poor, focal = [], _focal_std(fit)
     if len(fit.views) < POOR_VIEWS:
-        poor.append(f"{len(fit.views)} views; expected {POOR_VIEWS} or more: take more pictures")
+        poor.append(f"{len(fit.views)} views; expected {POOR_VIEWS} or more: take more images")
     if covered.share < POOR_SHARE:
         poor.append(
-            f"corners in {100 * covered.share:.0f} % of the picture; expected "
-            f"{100 * POOR_SHARE:.0f} % or more: take pictures with the board in the empty cells"
+            f"corners in {100 * covered.share:.0f} % of the image; expected "
+            f"{100 * POOR_SHARE:.0f} % or more: take images with the board in the empty cells"
         )
     if covered.reach < POOR_REACH:
         poor.append(
-            f"corners reach {100 * covered.reach:.0f} % of the way to the picture's corners; "
-            f"expected {100 * POOR_REACH:.0f} % or more: distortion is largest there"
+            f"corners reach {100 * covered.reach:.0f} % of the way to the image's corners; "
+            f"expected {100 * POOR_REACH:.0f} % or more, since distortion is largest in corners: "
+            "move the board into them"
         )
     if focal > POOR_FOCAL:
         poor.append(
@@ -168,12 +169,13 @@ def _poor(fit: LensFit, covered: Coverage, held_out: float) -> list[str]:
     if fit.rms_px > POOR_RMS_PX or held_out > POOR_RMS_PX:
         poor.append(
             f"error of {fit.rms_px:.2f} pixels, {held_out:.2f} on held-out views; expected "
-            f"{POOR_RMS_PX:g} or less: is the board flat, are pictures sharp and focus and zoom "
-            "fixed?"
+            f"{POOR_RMS_PX:g} or less: check that the board is flat, images are sharp, and focus "
+            "and zoom are fixed"
         )
     if held_out > POOR_RATIO * fit.rms_px:
         poor.append(
             f"error {held_out / fit.rms_px:.1f} times as large on held-out views as on fitted "
-            "ones: too few views for the parameters of the lens"
+            f"views; expected {POOR_RATIO:g} times or less: take more images, since these are too "
+            "few for the parameters of the lens"
         )
     return poor

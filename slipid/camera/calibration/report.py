@@ -13,8 +13,8 @@ from slipid.support.content import Content
 
 POOR_SCALE = 0.005
 POOR_FLOOR_PX = 1.5
-"""Relative std of lengths on the floor [1], and error of points on the floor [pixel], above which a
-camera is reported as poor."""
+"""Relative std of lengths on the floor [1], and error of floor points in the image [pixel], above
+which a camera is reported as poor."""
 POINTS_SHOWN = 12
 """Number of points, those with the largest errors, that the text lists; the file lists all."""
 UNITS = {"fx": " px", "fy": " px", "cx": " px", "cy": " px"}
@@ -48,12 +48,12 @@ def lens_report(quality: Quality, left_out: list[str]) -> Content:
 
 
 def floor_report(source: str, fit: FloorFit, spread: PlaceUncertainty, size_std: float) -> Content:
-    """Return the report of a camera's place above the floor, with lengths to check by tape.
+    """Return the report of a camera's pose above the floor, with lengths to check by tape.
 
     Args:
         source: description of where the points come from.
-        fit: the fit of the place.
-        spread: uncertainty of the place.
+        fit: the fit of the pose.
+        spread: uncertainty of the pose.
         size_std: relative std of the board's or tape's size [1].
     """
     keys = ("name", "pixel", "place_m", "off_px", "off_mm")
@@ -104,19 +104,20 @@ def marker_height(height_m: float) -> str:
     factor = height_m / (height_m - marker)
     return (
         f"a point h above the floor appears H / (H - h) times as far from the point below the "
-        f"lens as it is: with H = {height_m:.3g} m and a marker {marker:g} m up, lengths would "
-        f"come out {100 * (factor - 1):.1f} % too long if it were read on the floor: read it with "
-        "its height, and correct nothing twice"
+        f"lens as it is: with H = {height_m:.3g} m and a marker {marker:g} m above the floor, "
+        f"lengths would be {100 * (factor - 1):.1f} % too long if it were treated as lying on the "
+        "floor: give its height to `slipid track`, and do not correct the height again"
     )
 
 
 def _poor(fit: FloorFit, scale: float) -> list[str]:
-    """Return sentences about shortcomings of a camera's place."""
+    """Return sentences about shortcomings of a camera's pose above the floor."""
     poor = list(fit.left_out) if fit.disputed else []
     if fit.rms_px > POOR_FLOOR_PX and not poor:
         poor.append(
             f"points on the floor are off by {fit.rms_px:.1f} pixels; expected {POOR_FLOOR_PX:g} "
-            "or less: is the floor flat, is this lens that of the picture, are sizes right?"
+            "or less: check that the floor is flat, that the image was taken with this lens, and "
+            "that all sizes are right"
         )
     if scale > POOR_SCALE:
         poor.append(
@@ -125,14 +126,15 @@ def _poor(fit: FloorFit, scale: float) -> list[str]:
         )
     if fit.twin_px is not None and fit.twin_px < TWIN_RATIO * fit.rms_px:
         poor.append(
-            f"a second place of the camera explains the points nearly as well ({fit.twin_px:.2f} "
-            f"pixels, this one {fit.rms_px:.2f}): measure points that lie further apart"
+            f"a second pose of the camera explains the points nearly as well (error "
+            f"{fit.twin_px:.2f} pixels, this pose {fit.rms_px:.2f}): measure points that lie "
+            "further apart"
         )
     return poor
 
 
 def report_lines(report: Content, lens_too: bool = True) -> list[str]:
-    """Return a camera file's report as lines of text, without the lens if not `lens_too`."""
+    """Return a camera file's report as lines of text; `lens_too` includes the lens's report."""
     lens, floor, poor = report.get("lens"), report.get("floor"), report.get("poor", [])
     lines = list(_lens(lens)) if lens and lens_too else []
     lines += _floor(floor) if floor else []
@@ -162,15 +164,15 @@ def _lens(lens: Content) -> Iterator[str]:
         f"{lens['held_out_rms_px']:.3f} px"
     )
     yield (
-        f"  corners in {100 * covered['share']:.0f} % of the picture's cells, and "
-        f"{100 * covered['reach']:.0f} % of the way to its corners or more; tilts from "
+        f"  corners in {100 * covered['share']:.0f} % of the image's cells, and at least "
+        f"{100 * covered['reach']:.0f} % of the way to each image corner; tilts from "
         f"{min(tilts):.0f} to {max(tilts):.0f} degrees"
     )
 
 
 def _floor(floor: Content) -> Iterator[str]:
-    """Yield the lines of the report of a camera's place."""
-    yield f"place above the floor: {floor['source']}"
+    """Yield the lines of the report of a camera's pose above the floor."""
+    yield f"pose above the floor: {floor['source']}"
     points = floor.get("points", [])
     shown = sorted(points, key=lambda p: -math.hypot(*p["off_px"]))[:POINTS_SHOWN]
     for point in points:
@@ -191,10 +193,10 @@ def _floor(floor: Content) -> Iterator[str]:
             f"{at:.3f} ± {std:.3f}"
             for at, std in zip(floor["place_m"][:2], floor["place_std_m"][:2], strict=True)
         )
-        yield f"  it hangs above x = {x} m, y = {y} m of the floor"
+        yield f"  the camera hangs above x = {x} m, y = {y} m of the floor"
         yield (
-            f"  lengths on the floor are known to {100 * floor['scale_std']:.2f} %, of which the "
-            f"size of board or tape {100 * floor['size_std']:.2f} %"
+            f"  lengths on the floor are known to {100 * floor['scale_std']:.2f} %; the size of "
+            f"board or tape contributes {100 * floor['size_std']:.2f} %"
         )
     yield (
         f"  check by tape: the lens hangs {floor['height_m']:.3f} m above the floor; where its "

@@ -1,1 +1,1 @@
-"""Floor maps from pictures: the surface that each cell of a floor resembles."""
+"""Floor maps from images: the surface that each cell of a floor most resembles."""

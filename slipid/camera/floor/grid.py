@@ -1,4 +1,4 @@
-"""The floor as square cells, the picture projected onto them, and robots that hide the floor."""
+"""The floor as square cells, the image projected onto them, and robots that hide the floor."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +14,12 @@ from slipid.support.errors import DataError
 LEAST_CELLS, MOST_CELLS = 400, 4_000_000
 """Smallest and largest number of cells of a map."""
 FARTHEST_IN_HEIGHTS = 3.0
-"""Largest distance of mapped floor from the point below the lens, in heights of the lens above the
-floor [1]."""
+"""Largest distance of mapped floor from the lens, horizontally, in multiples of the lens's height
+above the floor [1]."""
 
 
 class Extent(NamedTuple):
-    """A rectangle of the floor along the axes [m]."""
+    """A rectangle of the floor with edges along the world's x and y axes [m]."""
 
     low_x: float
     low_y: float
@@ -56,23 +56,24 @@ class Grid:
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     def steps(self, xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Return column and row of places [m] without rounding; 0, 0 is the first cell's middle."""
+        """Return column and row of floor points [m], unrounded; 0, 0 is the first cell's middle."""
         return (xy - np.array([self.low_x, self.low_y])) / self.cell - 0.5
 
     def places(self, corners: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Return x and y [m] of cell corners; 0, 0 is the lowest corner of the first cell."""
+        """Return x and y [m] of cell corners, given by column and row; 0, 0 is at low_x, low_y."""
         return np.array([self.low_x, self.low_y]) + corners * self.cell
 
 
 @dataclass(frozen=True, eq=False)
 class Rectified:
-    """A picture projected onto the floor.
+    """An image projected onto the floor.
 
     Attributes:
         grid: cells of the floor.
         colour: blue, green, red of each cell, 0 to 255; 0 where the camera does not see the cell.
-        in_view: cells that the camera sees.
-        pixels: place in the picture of the middle of each cell [pixel].
+        in_view: mask of the cells that the camera sees.
+        pixels: pixel at which the middle of each cell appears [pixel]; NaN for a cell outside the
+            lens's view.
     """
 
     grid: Grid
@@ -81,16 +82,17 @@ class Rectified:
     pixels: Float[np.ndarray, "row column 2"]
 
     def of_picture(self, mask: Bool[np.ndarray, "y x"]) -> Mask:
-        """Return the cells in view whose pixel is set in a mask of the picture."""
+        """Return a mask of the cells in view whose pixel is set in a mask of the image."""
         across, down = (np.nan_to_num(np.rint(self.pixels[..., k])).astype(int) for k in (0, 1))
         height, width = mask.shape
         return mask[down.clip(0, height - 1), across.clip(0, width - 1)] & self.in_view
 
 
 def filled(polygon: Float[np.ndarray, "corner 2"], rows: int, columns: int) -> Mask:
-    """Return the points of a grid that lie in a polygon, whose corners are columns and rows."""
+    """Return a mask of the grid points in a polygon, whose corners are given as column and row."""
     mask = np.zeros((rows, columns), np.uint8)
-    parts = 16  # OpenCV draws to a sixteenth of a step, set by the last argument below
+    # OpenCV takes corners as integers: in sixteenths, 4 fractional bits in the last argument below
+    parts = 16
     corners = np.rint(np.clip(polygon, -1e6, 1e6) * parts).astype(np.int32)
     cv2.fillPoly(mask, [corners.reshape(-1, 1, 2)], 1, cv2.LINE_8, 4)
     return mask.astype(bool)
@@ -107,14 +109,17 @@ def view_of(camera: OverheadCamera) -> Extent:
         np.linalg.norm(floor - camera.place[:2], axis=1) <= FARTHEST_IN_HEIGHTS * camera.height
     ]
     if not len(floor):
-        raise DataError("the camera sees no floor nearby; expected one that looks down")
+        raise DataError(
+            "the camera sees no floor nearby; expected a camera file of a camera that looks down"
+        )
     return Extent(*map(float, (*floor.min(axis=0), *floor.max(axis=0))))
 
 
 def _pixel_grid(camera: OverheadCamera, edge: float) -> Float[np.ndarray, "65 65 2"]:
-    """Return pixels that cover a picture evenly, at a distance `edge` from its outermost pixels.
+    """Return a grid of pixels that covers an image evenly.
 
-    At -0.5 they reach its outer edge.
+    The grid's border is `edge` [pixel] inside the middles of the outermost pixels; with -0.5 it is
+    the outer edge of the image.
     """
     width, height = camera.lens.image_px
     across = np.linspace(edge, width - 1 - edge, 65)
@@ -136,7 +141,7 @@ def grid_over(extent: Extent, cell: float, picture: Path) -> Grid:
     Args:
         extent: the rectangle.
         cell: edge length of a cell [m].
-        picture: file of the picture, for messages.
+        picture: file of the image, for messages.
 
     Raises:
         DataError: there would be too many cells or too few.
@@ -154,7 +159,7 @@ def grid_over(extent: Extent, cell: float, picture: Path) -> Grid:
 
 
 def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid: Grid) -> Rectified:
-    """Return the picture projected onto the floor; cells out of view are black."""
+    """Return the image projected onto the floor; cells out of view are black."""
     centres = grid.centres()
     points = np.concatenate([centres, np.zeros((*centres.shape[:2], 1))], axis=-1)
     ahead = _before_lens(camera, points)
@@ -165,7 +170,8 @@ def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid:
         inside = (pixels > -0.5).all(axis=-1) & (pixels < [width - 0.5, height - 0.5]).all(axis=-1)
     in_view = inside & ahead
     ratio = grid.cell / pixel_size(camera)
-    if ratio > 1.5:  # otherwise a cell would have the colour of one of its many pixels
+    if ratio > 1.5:
+        # blur first, so that a cell gets the mean colour of its many pixels instead of one of them
         picture = cv2.GaussianBlur(picture, (0, 0), 0.4 * ratio)
     maps = [np.nan_to_num(pixels[..., k], nan=-9.0).astype(np.float32) for k in (0, 1)]
     colour = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -174,10 +180,10 @@ def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid:
 
 
 def _before_lens(camera: OverheadCamera, points: Float[np.ndarray, "row column 3"]) -> Mask:
-    """Return which points lie in front of the lens, within the angle that its picture covers.
+    """Return a mask of the points in front of the lens, near and within its angle of view.
 
-    Other points must be excluded, since the distortion of a lens is a polynomial that would map
-    points far outside the picture back into it.
+    All other points must be excluded, since the distortion of a lens is a polynomial that would map
+    points far outside the image back into it.
     """
     ideal = camera.lens.ideal(_pixel_grid(camera, 0.0))
     widest = 1.02 * np.linalg.norm(ideal, axis=-1).max()
@@ -206,11 +212,11 @@ class RobotShape:
 
 @dataclass(frozen=True)
 class DetectedRobot:
-    """A robot in the picture.
+    """A robot in the image.
 
     Attributes:
         marker: number of its marker in the dictionary.
-        x, y: place of the robot's middle on the floor [m].
+        x, y: position of the robot's middle on the floor [m].
     """
 
     marker: int
@@ -221,7 +227,7 @@ class DetectedRobot:
 def detected_robots(
     picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, shape: RobotShape
 ) -> tuple[DetectedRobot, ...]:
-    """Return all robots whose markers are detected in a picture."""
+    """Return all robots whose markers are detected in an image."""
     detector = cv2.aruco.ArucoDetector(marker_dictionary(shape.dictionary))
     corners, numbers, _ = detector.detectMarkers(picture)
     robots = []
@@ -236,7 +242,7 @@ def detected_robots(
 def hidden_by(
     robot: DetectedRobot, shape: RobotShape, camera: OverheadCamera
 ) -> Bool[np.ndarray, "y x"]:
-    """Return the pixels that show a robot's top or side instead of the floor."""
+    """Return a mask of the pixels that show a robot's top or side instead of the floor."""
     around = np.linspace(0, 2 * np.pi, 72, endpoint=False)
     ring = shape.radius * np.stack([np.cos(around), np.sin(around)], axis=-1) + [robot.x, robot.y]
     levels = np.linspace(0, shape.height, 5)

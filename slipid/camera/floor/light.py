@@ -1,10 +1,10 @@
-"""Colours of a picture, and the illumination of the floor in it.
+"""Colours of an image, and the illumination of the floor in it.
 
 Colours have two forms here: linear RGB, in which light is additive, and CIELAB, in which distances
-correspond to differences that people perceive. A surface of colour c appears at a place x as
-gain(x) c + veil(x) in linear RGB. The gain is due to shading and to the lens, whose picture is
-darker at the edges; the veil is light that the floor mirrors or the lens scatters. Both change
-slowly over the floor.
+correspond to differences that people perceive. A surface of colour c appears at a position x in the
+image as gain(x) c + veil(x) in linear RGB. The gain is due to shading and to the lens, whose image
+is darker at the edges; the veil is light that the floor mirrors or the lens scatters. Gain and veil
+change slowly over the floor.
 """
 
 from dataclasses import dataclass, replace
@@ -15,14 +15,14 @@ from jaxtyping import Float, Int, UInt8
 from slipid.camera.opencv import cv2
 
 DEGREE = 4
-"""Highest sum of the degrees in x and y of the polynomials in a gain or a veil."""
+"""Highest total degree in x and y of the polynomials that describe gain and veil."""
 STIFF_GAIN, STIFF_VEIL = 3e-4, 1e-3
-"""Weights of the penalties that pull the gain to 1 and the veil to 0, relative to the weighted mean
-square misfit of colours [1]."""
+"""Weights of the penalties on the gain's deviation from 1 and on the veil, relative to the weighted
+mean square misfit of colours [1]."""
 ALTERNATIONS = 6
 """Number of iterations in which illumination and colours are fitted alternately."""
 DARK = 0.03
-"""Linear RGB value below which noise is about constant; above it noise grows with the value [1]."""
+"""Linear RGB value up to which noise is about constant and above which noise grows with it [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,7 @@ class Features:
     """Features of every cell by which surfaces are distinguished.
 
     Attributes:
-        appearance: lightness L, a and b of CIELAB, and texture (see `texture`); the spreads of the
-            four within a surface differ from surface to surface.
+        appearance: lightness L, a and b of CIELAB, and texture (see `texture`).
         rgb: linear red, green and blue, 0 to 1.
     """
 
@@ -40,11 +39,11 @@ class Features:
 
 
 def features_of(colour: UInt8[np.ndarray, "row column 3"], smooth: float = 1.0) -> Features:
-    """Return the features of a picture in blue, green, red.
+    """Return the features of cells whose colours are given in blue, green, red.
 
     Args:
         colour: colours of the cells.
-        smooth: std of the Gaussian that smooths their noise [cells].
+        smooth: width sigma of the Gaussian kernel that smooths the colours' noise [cells].
     """
     fine = colour.astype(np.float32) / 255
     soft = cv2.GaussianBlur(fine, (0, 0), smooth)
@@ -56,8 +55,8 @@ def features_of(colour: UInt8[np.ndarray, "row column 3"], smooth: float = 1.0) 
 def texture(lightness: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
     """Return log(1 + v), where v is the variation of the lightness within a few cells.
 
-    v is a median over a window, so that edges between surfaces, thin lines in the window, do not
-    affect it.
+    v is a median over a window of 13 x 13 cells, so that an edge between surfaces, which is only a
+    thin line in the window, does not affect v.
     """
     change = np.abs(lightness - cv2.GaussianBlur(lightness, (0, 0), 2.5))
     coarse = np.clip(change * 16, 0, 255).astype(np.uint8)
@@ -80,7 +79,7 @@ def to_srgb(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]
 
 
 def lab_of(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Return the CIELAB values of linear RGB."""
+    """Return the CIELAB values of linear RGB values from 0 to 1."""
     bgr = to_srgb(rgb)[..., ::-1].astype(np.float32).reshape(-1, 1, 3)
     if not len(bgr):
         return np.zeros(rgb.shape)
@@ -119,7 +118,7 @@ class Illumination:
     def rgb_of(
         self, colours: Float[np.ndarray, "surface 3"], at: Float[np.ndarray, "place 2"]
     ) -> Float[np.ndarray, "surface place 3"]:
-        """Return the linear RGB in which surfaces appear at places, x and y from -1 to 1."""
+        """Return the linear RGB in which surfaces appear at positions x, y from -1 to 1."""
         basis = basis_at(at)
         gain, veil = 1 + basis @ self.gain, basis @ self.veil
         return np.maximum(gain[:, None] * colours[:, None, :] + veil, 1e-4)
@@ -127,7 +126,7 @@ class Illumination:
     def true_colours(
         self, rgb: Float[np.ndarray, "place 3"], at: Float[np.ndarray, "place 2"]
     ) -> Float[np.ndarray, "place 3"]:
-        """Return the surface colours that appear as `rgb` at places: the inverse of `rgb_of`."""
+        """Return the surface colours that appear as `rgb` at positions: inverse of `rgb_of`."""
         basis = basis_at(at)
         gain = np.maximum(1 + basis @ self.gain, 0.1)
         return np.clip((rgb - basis @ self.veil) / gain[:, None], 1e-4, 1)
@@ -135,12 +134,12 @@ class Illumination:
 
 @dataclass(frozen=True, eq=False)
 class ColourSamples:
-    """Colours in the picture at places whose surface is assumed to be known.
+    """Colours of cells whose surface is assumed to be known.
 
     Attributes:
-        at: x and y of each place, from -1 to 1 over the picture.
-        rgb: linear RGB measured there.
-        surface: number of the surface.
+        at: x and y of each cell, scaled to -1 to 1 over the grid.
+        rgb: linear RGB of each cell.
+        surface: number of each cell's surface.
         weight: weight of the sample in the fit.
     """
 
@@ -173,7 +172,7 @@ def fit_illumination(samples: ColourSamples, start: LitColours) -> LitColours:
 
 
 def basis_at(at: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, "place function"]:
-    """Return products of Legendre polynomials of x and y up to `DEGREE`, without the constant."""
+    """Return products of Legendre polynomials in x and y, of total degree 1 to `DEGREE`."""
     inside = np.clip(at, -1, 1)
     x, y = (np.polynomial.legendre.legvander(inside[:, k], DEGREE) for k in (0, 1))
     return np.stack([x[:, i] * y[:, j] for i, j in _powers()[1:]], axis=1)
@@ -186,7 +185,7 @@ def _powers() -> list[tuple[int, int]]:
 def _weights(samples: ColourSamples, fit: LitColours) -> Float[np.ndarray, "place 3"]:
     """Return the weight of each sample and channel.
 
-    Weights are lower for bright colours, whose noise is larger, and for samples that fit badly.
+    Weights are lower for bright colours, whose noise is larger, and for samples with large errors.
     """
     expected = fit.illumination.rgb_of(fit.colours, samples.at)
     own = expected[samples.surface, np.arange(len(samples.surface))]

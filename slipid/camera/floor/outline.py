@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, Int
 from slipid.camera.opencv import Labels, Mask, cv2
 
 FITTED_STEPS = 6
-"""Smallest number of steps of a border part to which a line is fitted; a step is a cell's edge."""
+"""Smallest number of steps (cell edges) of a border section to which a line is fitted; in a shorter
+section the line joins the first and last step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,11 +18,11 @@ class PatchOutline:
     """A connected patch of cells and its polygon.
 
     Attributes:
-        label: label of its cells.
-        cells: mask of its cells.
-        rings: polygons, whose corners are columns and rows of cell corners. The first ring runs
-            around the patch, the others around holes in it. A ring's last corner does not repeat
-            its first.
+        label: label of the patch's cells.
+        cells: mask of the patch's cells.
+        rings: polygons with corners in columns and rows, where integers are corners of cells. The
+            first ring runs around the patch, the other rings around holes in it. A ring's last
+            corner does not repeat its first.
     """
 
     label: int
@@ -30,11 +31,11 @@ class PatchOutline:
 
 
 def outlines_of(labels: Labels, tolerance: float) -> tuple[PatchOutline, ...]:
-    """Return all connected patches of labels from 0 on, the largest first.
+    """Return all connected patches of cells with labels of 0 or more, the largest first.
 
     Args:
         labels: label of each cell.
-        tolerance: largest distance of a polygon's line from the cell edges that it replaces
+        tolerance: largest distance of a polygon's edge from the cell edges that it replaces
             [cells].
     """
     fixed = _junctions(labels)
@@ -51,17 +52,17 @@ def outlines_of(labels: Labels, tolerance: float) -> tuple[PatchOutline, ...]:
 
 
 def signed_area(ring: Float[np.ndarray, "corner 2"]) -> float:
-    """Return the area of a ring, positive where it runs anticlockwise."""
+    """Return the area of a ring, positive if the ring runs anticlockwise."""
     x, y = ring.T
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def _rings(cells: Mask) -> list[Int[np.ndarray, "_ 2"]]:
-    """Return the cell corners along each edge of a connected patch, the outer edge first.
+    """Return the cell corners along each border of a connected patch, the outer border first.
 
-    Corners are one step apart. OpenCV's contours run through the middles of pixels; here they are
-    computed on a grid twice as fine, on which a cell covers three by three points, so that they run
-    along the edges of cells.
+    Corners are one step apart. OpenCV's contours run through the middles of pixels. To get contours
+    along the edges of cells, compute them on a grid twice as fine, on which a cell covers three
+    by three points.
     """
     rows, columns = np.nonzero(cells)
     low = np.array([columns.min(), rows.min()])
@@ -77,7 +78,7 @@ def _rings(cells: Mask) -> list[Int[np.ndarray, "_ 2"]]:
 def _corners(fine: Int[np.ndarray, "point 2"]) -> Int[np.ndarray, "corner 2"]:
     """Return the cell corners along a contour of the finer grid.
 
-    The contour cuts off a corner where the edge turns inwards; such corners are restored.
+    OpenCV's contour cuts off the corner where a border turns inwards; these corners are restored.
     """
     after = np.roll(fine, -1, axis=0)
     diagonal = (fine != after).all(axis=1)
@@ -88,7 +89,7 @@ def _corners(fine: Int[np.ndarray, "point 2"]) -> Int[np.ndarray, "corner 2"]:
 
 
 def _junctions(labels: Labels) -> Bool[np.ndarray, "row1 column1"]:
-    """Return the cell corners that stay fixed: junctions of borders, and corners of the map."""
+    """Return a mask of the cell corners that stay fixed: junctions of borders and map corners."""
     wide = np.pad(labels, 1, constant_values=-2)
     a, b, c, d = wide[:-1, :-1], wide[:-1, 1:], wide[1:, 1:], wide[1:, :-1]
     changes = sum((one != other).astype(int) for one, other in ((a, b), (b, c), (c, d), (d, a)))
@@ -102,11 +103,12 @@ def _simplified(
 ) -> Float[np.ndarray, "corner 2"]:
     """Return a ring simplified to few corners.
 
-    Each part between two junctions is simplified separately, so that the patches on both sides get
-    the same line.
+    Each section between two junctions is simplified separately, so that the patches on both sides
+    of it get the same line.
     """
     ends = np.flatnonzero(fixed[ring[:, 1], ring[:, 0]])
-    if not len(ends):  # no junction: begin at the lowest corner, the same for both patches
+    if not len(ends):
+        # without a junction, begin at the lowest corner, which is the same for both patches
         ends = np.array([np.lexsort((ring[:, 1], ring[:, 0]))[0]])
     turned = np.roll(ring, -ends[0], axis=0)
     closed = np.concatenate([turned, turned[:1]]).astype(float)
@@ -120,14 +122,17 @@ def _line(path: Float[np.ndarray, "step 2"], tolerance: float) -> Float[np.ndarr
 
     The result does not depend on the direction of the border.
     """
-    if (path[0] == path[-1]).all():  # a loop: its farthest corner splits it in two
+    if (path[0] == path[-1]).all():
+        # a closed loop has no chord to simplify against: split it at the corner farthest from its
+        # start
         distance = ((path - path[0]) ** 2).sum(axis=1)
         turn = int(np.lexsort((path[:, 1], path[:, 0], distance))[-1])
         halves = _line(path[: turn + 1], tolerance), _line(path[turn:], tolerance)
         return np.concatenate([halves[0][:-1], halves[1]])
     reverse = tuple(path[::-1].ravel()) < tuple(path.ravel())
     path = path[::-1] if reverse else path
-    # the ends of a step lie up to half a step off a slanted border, its middle lies on the border
+    # use the middles of steps: a slanted border runs through them, but up to half a step beside
+    # the steps' ends
     middles = np.concatenate([path[:1], (path[1:] + path[:-1]) / 2, path[-1:]])
     twice = np.rint(2 * middles).astype(np.int32)
     few = cv2.approxPolyDP(twice.reshape(-1, 1, 2), 2 * tolerance, False).reshape(-1, 2)
@@ -136,7 +141,7 @@ def _line(path: Float[np.ndarray, "step 2"], tolerance: float) -> Float[np.ndarr
 
 
 def _indices(path: Int[np.ndarray, "step 2"], few: Int[np.ndarray, "corner 2"]) -> list[int]:
-    """Return the indices in a path of `few` of its points, which are in the path's order."""
+    """Return the index in `path` of each of its points in `few`, which has the path's order."""
     index = [0]
     for corner in few[1:]:
         rest = path[index[-1] + 1 :]
@@ -147,18 +152,19 @@ def _indices(path: Int[np.ndarray, "step 2"], few: Int[np.ndarray, "corner 2"]) 
 def _fitted(
     middles: Float[np.ndarray, "step 2"], index: list[int], tolerance: float
 ) -> Float[np.ndarray, "corner 2"]:
-    """Return corners as intersections of the lines fitted between them; end points stay fixed."""
+    """Return corners moved to intersections of the lines fitted between them; ends stay fixed."""
     lines = [_through(middles[a : b + 1]) for a, b in pairwise(index)]
     out = middles[index].copy()
     for k in range(1, len(index) - 1):
         (p, along), (q, other) = lines[k - 1], lines[k]
         both = np.stack([along, -other], axis=1)
-        if abs(np.linalg.det(both)) > 0.1:  # otherwise the two lines are nearly parallel
+        # intersect the two lines unless they are nearly parallel
+        if abs(np.linalg.det(both)) > 0.1:
             meet = p + along * np.linalg.solve(both, q - p)[0]
         else:
             feet = [on + d * float((out[k] - on) @ d) for on, d in lines[k - 1 : k + 1]]
             meet = (feet[0] + feet[1]) / 2
-        # the middles of steps cut off a corner by up to half a step
+        # allow half a step more than the tolerance, since the middles of steps cut corners off
         if np.linalg.norm(meet - out[k]) <= tolerance + 0.5:
             out[k] = meet
     return out
@@ -169,10 +175,11 @@ def _through(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return a point and the direction of the line fitted to steps.
 
-    For few steps it is the line from the first to the last one.
+    With fewer than `FITTED_STEPS` steps the line runs from the first to the last step.
     """
     if len(steps) < FITTED_STEPS:
         return steps[0], (steps[-1] - steps[0]) / np.linalg.norm(steps[-1] - steps[0])
-    inner = steps[1:-1]  # the steps at the ends may belong to the neighbouring lines
+    # leave out the first and last step, which may belong to the neighbouring lines
+    inner = steps[1:-1]
     middle = inner.mean(axis=0)
     return middle, np.linalg.svd(inner - middle, full_matrices=False)[2][0]

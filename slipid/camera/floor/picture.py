@@ -1,4 +1,4 @@
-"""A map of the floor made from one picture taken from above."""
+"""A map of the floor made from one image taken from above."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -44,10 +44,10 @@ class MapOptions:
     """Options of a map.
 
     Attributes:
-        config: file of a palette; None to propose surfaces from the picture.
-        surfaces: number of surfaces to propose; None to choose it from the picture.
-        robot: shape of robots in the picture, which are masked.
-        cell: edge length of a cell [m]; None for that of a pixel on the floor.
+        config: file of a palette; None to propose surfaces from the image.
+        surfaces: number of surfaces to propose; None to determine the number from the image.
+        robot: shape of robots in the image, which are masked.
+        cell: edge length of a cell [m]; None for the edge length of a pixel on the floor.
     """
 
     config: Path | None = None
@@ -57,19 +57,19 @@ class MapOptions:
 
 
 def map_of(path: Path, camera: OverheadCamera, options: MapOptions, report: Reporter) -> PictureMap:
-    """Return the map of a picture.
+    """Return the map of an image.
 
     Raises:
-        DataError: the file is not a picture, its resolution is not the camera's, or the config does
-            not fit the picture.
+        DataError: the file is not an image, its resolution is not the camera's, or the config is
+            inconsistent with the image.
     """
-    report.stage("laying the picture onto the floor")
+    report.stage("projecting the image onto the floor")
     palette = Palette(schema=SCHEMA) if options.config is None else read_palette(options.config)
     source = FloorPicture(path, still(path), camera, options.config or path, palette)
     if palette.names and options.surfaces is not None:
         raise DataError(
-            f"{options.config}: it names {len(palette.names)} surfaces; expected no --surfaces "
-            "with it"
+            f"{options.config}: the config already has {len(palette.names)} surfaces; omit "
+            "--surfaces, or the surfaces in the config"
         )
     region = requested_region(source, options.robot, options.cell)
     report.stage("separating surfaces")
@@ -94,12 +94,13 @@ def map_of(path: Path, camera: OverheadCamera, options: MapOptions, report: Repo
 
 
 def _with_matches(seeds: Seeds, region: FloorRegion) -> Seeds:
-    """Return seeds with more marked cells for surfaces that have at most one marked point.
+    """Return seeds with additional marked cells for surfaces that have at most one marked point.
 
-    These cells are on patches whose colour matches the surface.
+    The additional cells are on patches whose colour matches the surface.
     """
     count = np.bincount(seeds.marked[:, 2], minlength=len(seeds.colours))
-    few = count <= (MARK_RADIUS + 1) ** 2  # number of cells around one point
+    # `surroundings` marks up to (MARK_RADIUS + 1)^2 cells around one point
+    few = count <= (MARK_RADIUS + 1) ** 2
     if not few.any():
         return seeds
     match = matched(region.features, region.visible, seeds.colours)
@@ -121,13 +122,14 @@ def check_all_present(source: FloorPicture, names: tuple[str, ...], labels: Labe
     absent = [name for k, name in enumerate(names) if not (labels == k).any()]
     if absent:
         raise DataError(
-            f"{source.config}: nothing in the picture looks most like {', '.join(absent)}; "
-            "expected a colour or points of a surface that is there and differs from the others"
+            f"{source.config}: no part of the image is closest in colour to {', '.join(absent)}; "
+            "expected the colour or points of a surface that the image shows and that differs from "
+            "the other surfaces"
         )
 
 
 def _config_of(source: FloorPicture, result: PictureMap, points: MarkedCells) -> str:
-    """Return the text of a config that marks the proposed surfaces by points in pixels."""
+    """Return the text of a config that marks the proposed surfaces by points in the image."""
     row, column, surface = points.T
     pixels = result.floor.pixels[row, column]
     surfaces = []

@@ -2,10 +2,10 @@
 
 A patch extends over slow changes of the light up to its edges. Without a config, distant patches
 are compared after removing the illumination, which is estimated from the patches recognised as
-similar so far; similar patches become one surface. With a config that specifies surfaces by colour
-alone, patches are matched with those colours. The colours alone do not suffice, since light changes
-them by more than they differ, but patches that match a colour well show the illumination, and with
-it more patches match.
+similar so far; similar patches become one surface. With a config that specifies surfaces only by
+colour, patches are matched with the given colours. Light may change colours by more than surfaces
+differ, so matching is repeated: patches that match a colour well show the illumination, and after
+it is removed more patches match.
 """
 
 from collections.abc import Sequence
@@ -28,37 +28,38 @@ from slipid.camera.opencv import Labels, Mask, cv2
 from slipid.support.errors import DataError
 
 JOIN_LIMITS = (5.0, 7.0, 8.0, 8.0, 8.0)
-"""Largest distance of colours of patches that count as one surface, per round [units of CIELAB]."""
+"""Largest colour distance of patches that count as one surface, in each round [CIELAB units]."""
 SEPARATE_FROM = 7.0
-"""Smallest distance of colours of patches that are proposed as two surfaces [units of CIELAB]. It
-is small, since users can easily give two proposed surfaces one name, but not easily split one."""
+"""Smallest colour distance of patches that are proposed as two surfaces [CIELAB units]. It is
+small, since users can easily give two proposed surfaces the same name, but not easily split one."""
 LEAST_PART = 0.002
 """Fraction of the floor below which a patch is too small to propose a surface [1]."""
 LIGHTNESS_WEIGHT = 0.8
 """Weight of a difference of lightness relative to one of a or b [1]; it is below 1 since shading
 changes lightness."""
 TEXTURE_WEIGHT = 10.0
-"""Distance of colours that a difference of 1 in texture equals [units of CIELAB]."""
+"""Colour distance [CIELAB units] that counts as much as a difference of 1 in texture."""
 ABOUT_SAMPLES = 4000
 """Approximate number of cells to which the illumination is fitted."""
 MOST_POINTS = 4
 """Largest number of points that mark a surface."""
 MATCH_LIMITS = (8.0, 10.0, 12.0, 14.0, 16.0, 16.0)
-"""Largest distance of a patch's colour from a given one that it matches, per round [CIELAB]."""
+"""Largest distance of a patch's colour from a given colour that it matches, in each round [CIELAB
+units]."""
 CLEAR_RATIO = 0.7
-"""Largest ratio of a patch's distance to the nearest colour and to the second nearest colour with
-which it still matches the nearest one [1]."""
+"""Largest ratio of a patch's distance to the nearest given colour to its distance to the second
+nearest with which the patch still matches the nearest [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Patches of uniform appearance, found in a picture of lower resolution (see `thinned`).
+    """Patches of uniform appearance, found in an image of lower resolution (see `thinned`).
 
     Attributes:
         appearance: L, a, b and texture of each patch.
-        place: row and column of the full picture's cell that is farthest from the patch's edge.
-        cells: number of cells of the full picture in each patch.
-        samples: colours in all patches; their `surface` is the number of the patch.
+        place: row and column, in the full grid, of the cell that is farthest from the patch's edge.
+        cells: number of cells of the full grid in each patch.
+        samples: colours in all patches; the samples' `surface` is the number of the patch.
     """
 
     appearance: Float[np.ndarray, "patch 4"]
@@ -73,7 +74,8 @@ def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCell
     Args:
         features: features of every cell.
         visible: cells that show the floor.
-        count: number of surfaces; None to separate all patches that are not clearly similar.
+        count: number of surfaces; None to separate patches whose colours differ by more than
+            `SEPARATE_FROM`.
 
     Raises:
         DataError: there are fewer patches than surfaces.
@@ -82,7 +84,7 @@ def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCell
     if len(patches.place) < max(1, count or 1):
         raise DataError(
             f"{len(patches.place)} uniform patches, too few for {count or 1} surfaces; expected "
-            "a picture of a floor: mark surfaces in a config, or name fewer with --surfaces"
+            "an image of a floor: mark surfaces in a config, or request fewer with --surfaces"
         )
     own = _clusters(patches, count)
     size = np.bincount(own, weights=patches.cells)
@@ -141,8 +143,9 @@ def _means(samples: ColourSamples) -> Float[np.ndarray, "surface 3"]:
 def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
     """Return the surface of each patch, by hierarchical clustering of the patches' colours.
 
-    At first each patch is a surface of its own, and the illumination is estimated from its changes
-    within patches. Patches recognised as similar then give a better estimate of it.
+    At first each patch is a surface of its own, and the illumination is estimated from changes of
+    colour within patches. Patches recognised as similar then give a better estimate of the
+    illumination.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -163,9 +166,9 @@ def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
 
 
 def _perceptual(lab: Float[np.ndarray, "place 3"]) -> Float[np.ndarray, "place 3"]:
-    """Return CIELAB with compressed chroma, so that distances of strong colours match perception.
+    """Return CIELAB values with compressed chroma and with lightness times `LIGHTNESS_WEIGHT`.
 
-    Lightness is multiplied by `LIGHTNESS_WEIGHT`.
+    The compression makes distances between strong colours match perception.
     """
     chroma = np.linalg.norm(lab[:, 1:], axis=1, keepdims=True)
     drawn = np.log1p(0.045 * chroma) / (0.045 * np.maximum(chroma, 1e-6))
@@ -173,7 +176,7 @@ def _perceptual(lab: Float[np.ndarray, "place 3"]) -> Float[np.ndarray, "place 3
 
 
 def _relit(illumination: Illumination, samples: ColourSamples) -> Float[np.ndarray, "place 3"]:
-    """Return the linear RGB that the samples would have at the place with the smallest veil."""
+    """Return the linear RGB that the samples would have at the position with the smallest veil."""
     plain = illumination.true_colours(samples.rgb, samples.at)
     veil = basis_at(samples.at) @ illumination.veil
     clearest = samples.at[[int(np.argmin(veil.sum(axis=1)))]]
@@ -183,7 +186,7 @@ def _relit(illumination: Illumination, samples: ColourSamples) -> Float[np.ndarr
 def matched(
     features: Features, visible: Mask, colours: Float[np.ndarray, "surface 3"]
 ) -> MarkedCells:
-    """Return the middles of patches that match one of the given colours [linear RGB]."""
+    """Return the middles of patches that match a given colour [linear RGB], with its number."""
     patches = patches_of(features, visible)
     count = len(patches.place)
     own = np.full(count, -1)
@@ -194,7 +197,7 @@ def matched(
     for near in MATCH_LIMITS:
         expected = _to_brightness(colours, fit.colours[: len(colours)], np.unique(own[own >= 0]))
         own = _nearest(patches, fit.illumination.rgb_of(expected, samples.at), near)
-        # a patch without a match counts as a surface of its own: it shows how the light changes
+        # keep a patch without a match as a surface of its own, since it shows how the light changes
         each = np.where(own >= 0, own, len(colours) + np.arange(count))
         fit = fit_illumination(replace(samples, surface=each[samples.surface]), fit)
     return np.column_stack([patches.place, own])[own >= 0]
@@ -205,9 +208,9 @@ def _to_brightness(
     fitted: Float[np.ndarray, "surface 3"],
     matched: Int[np.ndarray, " match"],
 ) -> Float[np.ndarray, "surface 3"]:
-    """Return the fitted colours of matched surfaces, and the given colours of all others.
+    """Return the fitted colours of matched surfaces, and scaled given colours of all others.
 
-    Given colours are scaled by the median ratio of fitted to given brightness.
+    The scale is the median ratio of fitted to given brightness of the matched surfaces.
     """
     if not len(matched):
         return given
@@ -220,7 +223,7 @@ def _to_brightness(
 def _nearest(
     patches: Patches, expected: Float[np.ndarray, "surface sample 3"], near: float
 ) -> Int[np.ndarray, " patch"]:
-    """Return the matching colour of each patch, or -1.
+    """Return the number of the colour that each patch matches, or -1 if it matches none.
 
     A patch has no match if no colour is near or if two colours are about equally near.
     """

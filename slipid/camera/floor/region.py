@@ -1,4 +1,4 @@
-"""The config of a map, and the cells of the part of the floor that it requests.
+"""The config of a floor map, and the cells of the part of the floor that the config requests.
 
 A config specifies surfaces by colour or by marked points, and may limit the map by a region and
 masks.
@@ -37,15 +37,15 @@ from slipid.support.errors import DataError
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
 ABSENT_FROM = 30.0
-"""Distance to the nearest cells' colours above which a colour counts as absent from the picture
-[units of CIELAB]."""
+"""Distance of a colour to the nearest cells' colours above which it counts as absent from the image
+[CIELAB units]."""
 SCHEMA: Literal["slipid.palette/1"] = "slipid.palette/1"
 Points = Annotated[list[Point], Field(min_length=1)]
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 
 class Places(Section):
-    """Places given either in the picture [pixel] or on the floor [m]."""
+    """Points given either in the image [pixel] or on the floor [m]."""
 
     at_px: Points | None = None
     at_m: Points | None = None
@@ -53,7 +53,10 @@ class Places(Section):
     @model_validator(mode="after")
     def _one(self) -> "Places":
         if (self.at_px is None) == (self.at_m is None):
-            raise ValueError("expected either at_px or at_m: [[x, y], ...]")
+            raise ValueError(
+                "both or neither of at_px and at_m are given; expected exactly one of them: "
+                "[[x, y], ...]"
+            )
         return self
 
 
@@ -101,8 +104,8 @@ def read_palette(path: Path) -> Palette:
         same = first.setdefault(colour.lower(), name)
         if same != name:
             raise DataError(
-                f"{path}: palette.{name}: '{colour}', the colour of {same}; expected another: "
-                "surfaces are distinguished by it"
+                f"{path}: palette.{name}: '{colour}' is also the colour of {same}; expected a "
+                "different colour for each surface"
             )
     return palette
 
@@ -112,14 +115,14 @@ def palette_text(surfaces: Sequence[str], image: str, before: Palette) -> str:
 
     Args:
         surfaces: TOML tables of the proposed surfaces, see `points_text`.
-        image: name of the picture.
+        image: name of the image.
         before: config without surfaces, whose region and masks are kept.
     """
     lines = [
         f"# Surfaces that `slipid map` proposed for {image}.",
         "# Rename them. Two with the same name become one surface: where the light differs much,",
         "# one surface is often proposed as two. If a surface is missing, add points on it.",
-        "# Then: slipid map IMAGE --config this file, with the other options as before.",
+        "# Then run `slipid map IMAGE --config THIS_FILE`, with the other options as before.",
         f'schema = "{SCHEMA}"',
         "",
     ]
@@ -136,7 +139,7 @@ def points_text(name: str, colour: str, share: float, pixels: Float[np.ndarray, 
         name: name of the surface.
         colour: its colour `#rrggbb`, for a comment.
         share: fraction of the mapped floor that it covers [1], for a comment.
-        pixels: points on the surface in the picture [pixel].
+        pixels: points on the surface in the image [pixel].
     """
     points = ", ".join(f"[{x:.0f}, {y:.0f}]" for x, y in pixels.tolist())
     return (
@@ -162,10 +165,10 @@ def _polygon(head: str, polygon: Polygon) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class FloorPicture:
-    """A picture of the floor, and the camera that took it.
+    """An image of the floor, and the camera that took it.
 
     Attributes:
-        path: file of the picture, for messages.
+        path: file of the image, for messages.
         picture: blue, green, red of every pixel.
         camera: the calibrated camera.
         config: file of the palette, for messages.
@@ -179,7 +182,7 @@ class FloorPicture:
     palette: Palette
 
     def cells(self, floor: Rectified, polygon: Polygon) -> Mask:
-        """Return the cells of the floor in a polygon."""
+        """Return a mask of the floor cells that lie in a polygon."""
         if polygon.at_m is not None:
             corners = floor.grid.steps(np.array(polygon.at_m))
             return filled(corners, floor.grid.rows, floor.grid.columns)
@@ -192,11 +195,11 @@ class FloorRegion:
     """The part of the floor to be mapped.
 
     Attributes:
-        source: the picture and its camera.
-        floor: the picture projected onto the floor.
-        requested: cells of the region that lie in the camera's view.
-        visible: requested cells that show the floor, not a mask or a robot.
-        robots: robots detected in the picture.
+        source: the image and its camera.
+        floor: the image projected onto the floor.
+        requested: mask of the region's cells that lie in the camera's view.
+        visible: mask of the requested cells that neither a mask of the config nor a robot hides.
+        robots: robots detected in the image.
     """
 
     source: FloorPicture
@@ -215,12 +218,12 @@ def requested_region(source: FloorPicture, robot: RobotShape, cell: float | None
     """Return the cells that a config requests, and which of them show the floor.
 
     Args:
-        source: the picture, its camera, and the config with its region and masks.
+        source: the image, its camera, and the config with its region and masks.
         robot: shape of robots that may hide the floor.
-        cell: edge length of a cell [m]; None for that of a pixel on the floor.
+        cell: edge length of a cell [m]; None for the edge length of a pixel on the floor.
 
     Raises:
-        DataError: the picture's resolution is not the camera's, or the region has no visible floor.
+        DataError: the image's resolution is not the camera's, or the region has no visible floor.
     """
     picture, camera, palette = source.picture, source.camera, source.palette
     camera.lens.check_size(size_of(picture), source.path)
@@ -231,8 +234,9 @@ def requested_region(source: FloorPicture, robot: RobotShape, cell: float | None
         requested &= source.cells(floor, palette.region)
     if requested.sum() < LEAST_CELLS:
         raise DataError(
-            f"{source.config if palette.region else source.path}: region: {requested.sum()} cells "
-            f"of {1e3 * grid.cell:.3g} mm that the camera sees; expected {LEAST_CELLS} or more"
+            f"{source.config if palette.region else source.path}: region: the camera sees "
+            f"{requested.sum()} cells of {1e3 * grid.cell:.3g} mm; expected {LEAST_CELLS} or more: "
+            "a larger region, or a smaller --cell"
         )
     visible = requested.copy()
     for polygon in palette.mask:
@@ -242,8 +246,8 @@ def requested_region(source: FloorPicture, robot: RobotShape, cell: float | None
         visible &= ~floor.of_picture(hidden_by(one, robot, camera))
     if visible.sum() < LEAST_CELLS:
         raise DataError(
-            f"{source.path}: masks and robots hide all but {visible.sum()} cells; expected "
-            f"{LEAST_CELLS} or more of floor"
+            f"{source.path}: masks and robots leave {visible.sum()} cells of visible floor; "
+            f"expected {LEAST_CELLS} or more"
         )
     return FloorRegion(source, floor, requested, visible, robots)
 
@@ -264,7 +268,7 @@ def _extent(source: FloorPicture) -> Extent:
     high = np.minimum(corners.max(axis=0, initial=-np.inf), view[2:])
     if not (low < high).all():
         raise DataError(
-            f"{source.config}: region: no floor that the camera sees; expected a polygon within "
+            f"{source.config}: region: the camera sees no floor in it; expected a polygon within "
             f"x {view.low_x:.2f} to {view.high_x:.2f} m, y {view.low_y:.2f} to {view.high_y:.2f} m"
         )
     return Extent(*map(float, (*low, *high)))
@@ -274,7 +278,7 @@ def seeds_of(region: FloorRegion) -> Seeds:
     """Return colours and marked cells of the surfaces that a config specifies.
 
     Raises:
-        DataError: a marked point does not show the floor, or a colour is absent from the picture.
+        DataError: a marked point does not show the floor, or a colour is absent from the image.
     """
     names, points = region.source.palette.names, [np.zeros((0, 3), int)]
     for k, one in enumerate(region.source.palette.points):
@@ -291,13 +295,13 @@ def seeds_of(region: FloorRegion) -> Seeds:
 
 
 def _marked(region: FloorRegion, marked: Places, k: int) -> Int[np.ndarray, "point 2"]:
-    """Return row and column of the marked points of entry `k` of a config."""
+    """Return row and column of the marked points in the config's entry `points[k]`."""
     source, grid = region.source, region.floor.grid
     given = np.array(marked.at_px or marked.at_m, float)
     width, height = size_of(source.picture)
     if marked.at_px is not None:
         out = ~((given >= -0.5) & (given < [width - 0.5, height - 0.5])).all(axis=1)
-        _refuse(source, given[out], k, f"outside the picture of {width} x {height} pixels")
+        _refuse(source, given[out], k, f"outside the image of {width} x {height} pixels")
         xy = source.camera.on_plane(given, 0.0)
     else:
         xy = given
@@ -322,7 +326,7 @@ def _refuse(
 
 
 def _given_colour(region: FloorRegion, name: str) -> Float[np.ndarray, "3"]:
-    """Return the linear RGB of a surface from the config.
+    """Return the linear RGB that the config gives for a surface.
 
     Raises:
         DataError: no visible cell has nearly that colour.
@@ -332,8 +336,8 @@ def _given_colour(region: FloorRegion, name: str) -> Float[np.ndarray, "3"]:
     off = np.linalg.norm(lab - lab_of(colour[None])[0], axis=1)
     if (nearest := float(np.percentile(off, 0.5))) > ABSENT_FROM:
         raise DataError(
-            f"{region.source.config}: palette.{name}: '{code}' is nowhere in the picture (the "
-            f"nearest is {nearest:.0f} off in CIELAB); expected a colour as the picture shows it, "
+            f"{region.source.config}: palette.{name}: '{code}' is nowhere in the image (the "
+            f"nearest is {nearest:.0f} CIELAB units off); expected a colour as the image shows it, "
             "or points on the surface"
         )
     return colour

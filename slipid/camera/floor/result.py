@@ -1,4 +1,4 @@
-"""The map made from a picture: outlines in metres, colours, and warnings about its quality."""
+"""The map made from an image: outlines in metres, colours, and warnings about its quality."""
 
 import hashlib
 from collections.abc import Sequence
@@ -21,26 +21,28 @@ HARDLY_DISTINCT, NOT_DISTINCT = 5.0, 3.5
 """Differences of appearance below which two surfaces are reported as hard to distinguish, and as
 indistinguishable [spreads within a surface].
 
-If one surface is given two names, the two differ by about 3.2, since the noise is divided in two.
+If one surface is given two names, the two differ by about 3.2, since each gets one half of the
+surface's spread of colours.
 """
 MOST_UNKNOWN = 1 / 3
 """Largest fraction of the requested floor that may be unknown in a good map [1]."""
 MOST_NAMED = 3
-"""Number of patches of low confidence that are reported one by one, the largest first."""
+"""Number of patches with low confidence that are reported one by one, the largest first; smaller
+ones are only counted."""
 WEAK_CONFIDENCE = 1.0
 """Confidence below which a patch is reported [spreads within a surface], see `_patch`."""
 OUTLINE_TOLERANCE = 0.6
-"""Largest distance of an outline from the cell edges that it replaces [cells]."""
+"""Largest distance of a patch's outline from the cell edges that it replaces [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PictureMap:
-    """A map of the floor made from a picture.
+    """A map of the floor made from an image.
 
     Attributes:
         vector: the map as polygons.
-        floor: the picture projected onto the floor.
-        labels: surface of each cell, in the order of its colours; -1 is unknown.
+        floor: the image projected onto the floor.
+        labels: surface of each cell, as an index into the colours of `vector`; -1 is unknown.
         robots: robots that hid a part of the floor.
         warnings: sentences about reasons for which the map is less certain.
         poor: sentences about reasons for which the map is bad.
@@ -91,7 +93,7 @@ def map_from(
     """Return the map of segmented cells, with outlines, colours and warnings.
 
     Args:
-        region: the part of the floor that is mapped; the map keeps the colours of its config.
+        region: the part of the floor that is mapped; colours in its config are kept in the map.
         names: names of the surfaces by number.
         surfaces: appearance of the surfaces.
         costs: cost of every surface in each cell.
@@ -103,10 +105,13 @@ def map_from(
     source, features = region.source, region.features
     present = [k for k in range(len(names)) if (labels == k).any()]
     if not present:
-        raise DataError(f"{source.path}: no cell looks like a surface; expected a floor")
+        raise DataError(
+            f"{source.path}: no cell resembles any surface; expected an image of a floor with the "
+            "surfaces of the config"
+        )
     number = np.full(len(names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
-    labels = number[labels]  # label UNKNOWN, -1, picks the last entry
+    labels = number[labels]  # UNKNOWN is -1 and so picks the last entry, which is UNKNOWN again
     seen = [np.median(features.rgb[labels == k], axis=0) for k in range(len(present))]
     colours = {names[k]: code_of_linear(rgb) for k, rgb in zip(present, seen, strict=True)}
     colours |= {name: source.palette.palette.get(name, seen) for name, seen in colours.items()}
@@ -118,13 +123,14 @@ def map_from(
     if unknown > MOST_UNKNOWN:
         poor.append(
             f"{100 * unknown:.0f} % of the requested floor is unknown; expected at most "
-            f"{100 * MOST_UNKNOWN:.0f} %: a region that holds nothing but floor, and points on "
-            "every surface"
+            f"{100 * MOST_UNKNOWN:.0f} %: limit the region to floor, and mark points on every "
+            "surface"
         )
-    if not region.robots and is_picture(source.path):  # the median of a video shows no moving robot
+    # warn only for single images, since the median of a video shows no moving robot
+    if not region.robots and is_picture(source.path):
         warnings.append(
-            "no marker of a robot was detected, so none is masked; where one stands, mask it in "
-            "the config, or name the --dictionary of its marker"
+            "no robot's marker was detected, so no robot is masked; if the image shows a robot, "
+            "mask it in the config, or give the --dictionary of its marker"
         )
     warnings += _weak_patches(vector)
     return PictureMap(
@@ -137,7 +143,7 @@ def _similar(
 ) -> tuple[list[str], list[str]]:
     """Return sentences about pairs of surfaces that are hard or impossible to distinguish.
 
-    The difference of appearances is the median over the picture, relative to the spread within a
+    The difference of appearances is the median over the image, relative to the spread within a
     surface.
     """
     appearances = surfaces.appearances((24, 24)).reshape(len(names), -1, 4)
@@ -147,22 +153,22 @@ def _similar(
         away = np.linalg.norm((appearances[one] - appearances[other]) / spread, axis=1)
         difference = float(np.median(away))
         about = (
-            f"be distinguished: they differ by {difference:.1f} spreads of one surface; mark more "
-            "points on them, or give them one name"
+            f"be distinguished: they differ by {difference:.1f} times the spread within a surface; "
+            "mark more points on them, or give them the same name"
         )
         if difference < NOT_DISTINCT:
             cannot.append(f"{names[one]} and {names[other]} cannot {about}")
         elif difference < HARDLY_DISTINCT:
-            hardly.append(f"{names[one]} and {names[other]} can hardly {about}")
+            hardly.append(f"{names[one]} and {names[other]} cannot easily {about}")
     return cannot, hardly
 
 
 def _patch(one: PatchOutline, region: FloorRegion, names: Sequence[str], costs: Costs) -> Patch:
     """Return a patch in metres, the outer ring anticlockwise and holes clockwise.
 
-    A cell's appearance has a distance to each surface [spreads within the surface]. The patch's
-    confidence is the median over its cells of the distance to the next best surface less that to
-    its own surface; it is None if there is no other surface.
+    A cell's appearance has a distance to each surface, in spreads within that surface. The patch's
+    confidence is the distance to the nearest other surface less the distance to the patch's own
+    surface, as a median over the patch's cells; it is None if there is no other surface.
     """
     rings = []
     for k, ring in enumerate(one.rings):
@@ -179,16 +185,18 @@ def _patch(one: PatchOutline, region: FloorRegion, names: Sequence[str], costs: 
 def _vector(
     region: FloorRegion, labels: Labels, patches: tuple[Patch, ...], colours: dict[str, str]
 ) -> VectorMap:
-    """Return the map in the form of its file."""
+    """Return the map as polygons with their region, as the map's file stores it."""
     most = int(np.argmax(np.bincount(labels[labels >= 0])))
     unknown, notes = float((labels < 0).mean()), []
     if unknown > 0:
         requested = (labels[region.requested] < 0).mean()
         notes.append(
             f"{100 * unknown:.1f} % of the map's rectangle is unknown ({100 * requested:.1f} % of "
-            "the requested floor): read as a floor map it has the nearest surface there"
+            "the requested floor); when this file is used as a floor map, unknown floor gets the "
+            "nearest surface"
         )
-    with region.source.path.open("rb") as file:  # not read at once: a video may exceed memory
+    # hash the file piece by piece, since a video may exceed memory
+    with region.source.path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     map_region = MapRegion(
         extent_m=region.floor.grid.extent,
@@ -212,9 +220,13 @@ def _weak_patches(vector: VectorMap) -> list[str]:
         x, y = patch.rings[0].mean(axis=0)
         sentences.append(
             f"the patch of {patch.surface} around x {x:.2f} m, y {y:.2f} m ({patch.area:.3g} m^2) "
-            f"looks almost as much like another surface ({patch.confidence:.1f} spreads)"
+            "looks almost as much like another surface (difference of "
+            f"{patch.confidence:.1f} spreads within a surface)"
         )
     if rest := weak[MOST_NAMED:]:
         area = sum(patch.area for patch in rest)
-        sentences.append(f"so do {len(rest)} smaller patches ({area:.3g} m^2)")
+        sentences.append(
+            f"{len(rest)} smaller patches ({area:.3g} m^2) also look almost as much like another "
+            "surface"
+        )
     return sentences

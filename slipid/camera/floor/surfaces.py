@@ -23,9 +23,9 @@ from slipid.camera.opencv import Labels, Mask, cv2
 
 MOST_ROUNDS = 10
 STEADY_SHARE = 3e-4
-"""Fraction of cells that change their surface in a round below which learning ends [1]."""
+"""Learning ends when less than this fraction of the cells changes its surface in a round [1]."""
 COARSE_CELLS = 25_000
-"""Approximate number of cells of the low resolution picture from which surfaces are learnt."""
+"""Approximate number of cells of the coarser grid from which surfaces are learnt, see `thinned`."""
 MOST_SAMPLES = 5_000
 """Largest number of cells to which illumination and colours are fitted."""
 LEAST_SPREAD = np.array([2.0, 1.5, 1.5, 0.25])
@@ -44,7 +44,7 @@ NEIGHBOUR_COST = 3.0
 """Additional cost of a surface in a cell whose neighbours all have another surface [squared
 spreads]."""
 NEIGHBOUR_STD = 1.5
-"""Std of the Gaussian that weights a cell's neighbours [cells]."""
+"""Width sigma of the Gaussian kernel that weights a cell's neighbours [cells]."""
 FIELD_ROUNDS = 5
 """Number of mean-field iterations over neighbouring cells."""
 SMALL_PATCH = 150
@@ -58,7 +58,10 @@ MarkedCells = Int[np.ndarray, "cell 3"]
 
 
 def surroundings(marked: MarkedCells, visible: Mask) -> MarkedCells:
-    """Return visible cells around each of the marked cells, marked with its surface."""
+    """Return visible cells around each marked cell, marked with the same surface.
+
+    They are the marked cell and every second cell within `MARK_RADIUS` along rows and columns.
+    """
     steps = np.arange(-MARK_RADIUS, MARK_RADIUS + 1, 2)
     down, across = (step.ravel() for step in np.meshgrid(steps, steps))
     around = np.stack([down, across, np.zeros(len(down), int)], axis=1)
@@ -104,14 +107,15 @@ class Surfaces:
     def costs(self, appearance: Float[np.ndarray, "row column 4"]) -> Costs:
         """Return the cost of each surface in each cell [squared spreads], limited above.
 
-        A wide spread adds to the cost, since otherwise a surface with any appearance would fit all
-        cells.
+        A wide spread adds to the cost, since otherwise the surface with the widest spread would
+        have the lowest cost in most cells.
         """
         out = np.empty((len(self.spread), *appearance.shape[:2]), np.float32)
         for k, expected in enumerate(self.appearances(appearance.shape[:2])):
             off = (appearance - expected) / self.spread[k].astype(np.float32)
             wide = 2 * np.log(self.spread[k] / LEAST_SPREAD).sum()
-            rough = np.minimum(off[..., 3] ** 2, 6.0)  # limited: edges and dirt are rough, too
+            # the cost of texture is limited, since edges and dirt are rough on every surface
+            rough = np.minimum(off[..., 3] ** 2, 6.0)
             out[k] = (off[..., :3] ** 2).sum(axis=-1) + rough + wide
         return np.minimum(out, 1.5 * OUTLIER_COST)
 
@@ -124,7 +128,7 @@ def positions(shape: tuple[int, int]) -> Float[np.ndarray, "place 2"]:
 
 
 def learnt(features: Features, visible: Mask, seeds: Seeds) -> Surfaces:
-    """Return the appearance of the surfaces in a picture, learnt from seeds."""
+    """Return the appearance of the surfaces in an image, learnt from seeds."""
     step = max(1, round(np.sqrt(visible.size / COARSE_CELLS)))
     few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
     shape = few.appearance.shape[:2]
@@ -159,7 +163,7 @@ def thinned(features: Features, step: int) -> Features:
 
 
 def _flat(appearance: Float[np.ndarray, "row column 4"]) -> Mask:
-    """Return cells whose neighbours look about the same; others lie on edges and mix colours."""
+    """Return a mask of the cells that do not lie at an edge, where colours mix."""
     lab = np.ascontiguousarray(appearance[..., :3])
     kernel = np.ones((3, 3), np.uint8)
     change = (cv2.dilate(lab, kernel) - cv2.erode(lab, kernel)).max(axis=-1)
@@ -167,11 +171,11 @@ def _flat(appearance: Float[np.ndarray, "row column 4"]) -> Mask:
 
 
 def _start(few: Features, marked: Int[np.ndarray, " seed"], seeds: Seeds) -> Surfaces:
-    """Return the appearance of the surfaces, from the seeds alone."""
+    """Return the appearance of the surfaces, estimated only from the seeds."""
     start = LitColours(Illumination.uniform(), seeds.colours)
     texture = np.full(len(seeds.colours), float(np.median(few.appearance[..., 3])))
     spread = np.tile(MOST_SPREAD, (len(seeds.colours), 1))
-    spread[:, 3] = 100.0  # a colour alone does not determine the texture
+    spread[:, 3] = 100.0  # without marked cells the texture is unknown: give it no influence
     if not len(marked):
         return Surfaces(start, texture, spread)
     rgb, rough = (
@@ -210,19 +214,20 @@ def _updated(
     samples = ColourSamples(at, few.rgb.reshape(-1, 3)[cells].astype(float), own, weight)
     fit = fit_illumination(samples, surfaces.lit)
     texture, spread = surfaces.texture.copy(), surfaces.spread.copy()
-    for k in np.unique(own):  # robust spread about the expected appearance
+    for k in np.unique(own):
         mine = own == k
         texture[k] = np.median(appearance[mine, 3])
         expected = lab_of(fit.illumination.rgb_of(fit.colours[k : k + 1], at[mine])[0])
         off = np.abs(
             appearance[mine] - np.column_stack([expected, np.full(mine.sum(), texture[k])])
         )
+        # a median instead of a standard deviation, since some cells have the wrong label
         spread[k] = np.clip(1.5 * np.median(off, axis=0), LEAST_SPREAD, MOST_SPREAD)
     return Surfaces(fit, texture, spread)
 
 
 def labelled(costs: Costs, visible: Mask) -> Labels:
-    """Return the surface of each cell; the number of surfaces marks cells that fit none of them."""
+    """Return the surface of each cell; a cell unlike every surface gets the number of surfaces."""
     outlier = np.full((1, *visible.shape), OUTLIER_COST, np.float32)
     return smoothed(np.concatenate([costs, outlier]), visible)
 
@@ -230,9 +235,9 @@ def labelled(costs: Costs, visible: Mask) -> Labels:
 def smoothed(costs: Costs, visible: Mask) -> Labels:
     """Return labels of low cost that agree with those of neighbouring cells.
 
-    The method is the mean field of a Potts model: each cell has a probability for every surface,
-    and the probabilities of its neighbours reduce the cost of their surfaces. Cells that are not
-    visible do not affect others and get the label `UNKNOWN`.
+    The method is the mean-field approximation of a Potts model: each cell has a probability for
+    every surface, and the more probable a surface is in neighbouring cells, the lower its cost in
+    the cell. Cells that are not visible do not affect others and get the label `UNKNOWN`.
     """
     weight = visible.astype(np.float32)
     around = np.maximum(cv2.GaussianBlur(weight, (0, 0), NEIGHBOUR_STD), 1e-3)
@@ -248,8 +253,8 @@ def smoothed(costs: Costs, visible: Mask) -> Labels:
 def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
     """Return labels with small or narrow patches merged into the nearest other patches.
 
-    Narrow patches arise along the edge of two surfaces, where the mixed colour may resemble a third
-    surface.
+    Narrow patches arise along the edge between two surfaces, where the mixed colour may resemble a
+    third surface.
 
     Args:
         labels: surface of each cell.
@@ -261,7 +266,7 @@ def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
     kept = np.zeros(labels.shape, bool)
     for surface in np.unique(labels):
         mine = (labels == surface).astype(np.uint8)
-        # a hidden cell may have any surface, so patches at hidden cells do not count as narrow
+        # count hidden cells as part of the patch, which may continue there and not be narrow
         opened = cv2.morphologyEx(mine | (~visible).astype(np.uint8), cv2.MORPH_OPEN, disc)
         kept |= (opened > 0) & (mine > 0)
     labels = np.where(visible, _nearest(labels, kept & visible), UNKNOWN)

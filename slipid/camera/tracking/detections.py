@@ -20,7 +20,7 @@ from slipid.support.progress import Reporter
 CHECKPOINT_S = 10.0
 """Time between two checkpoints [s]."""
 CHECKPOINT_NAME = "sightings"
-"""Name under which a checkpoint stores the detections."""
+"""Name under which the detections are stored in a checkpoint."""
 KINDS = {"frame": int, "time": float, "repeated": bool, "row": int, "id": int, "corners": float}
 """Number type of each attribute of `Detections`."""
 FIRST_FRAMES = 100
@@ -33,10 +33,10 @@ class Detections:
 
     Attributes:
         frame, time: number and time [s] of every frame.
-        repeated: True if a frame's picture is identical to that of the frame before.
+        repeated: True if a frame's image is identical to that of the frame before.
         row: frame of each detection, as an index into `frame`.
         id: number of the detected marker.
-        corners: x, y of its corners in OpenCV's order [pixel].
+        corners: x, y of the detected marker's corners in OpenCV's order [pixel].
     """
 
     frame: Int[np.ndarray, " frame"]
@@ -48,7 +48,7 @@ class Detections:
 
     @classmethod
     def of(cls, lists: dict[str, list[Any]]) -> "Detections":
-        """Return the detections as arrays from lists, which are keyed by the attributes' names."""
+        """Return the detections as arrays, from lists keyed by the names of the attributes."""
         arrays = {name: np.array(lists[name], kind) for name, kind in KINDS.items()}
         return cls(**arrays | {"corners": arrays["corners"].reshape(-1, 4, 2)})
 
@@ -70,7 +70,7 @@ class Detections:
 def detect_all(
     source: FrameSource, tracker: MarkerTracker, checkpoint: Checkpoint, report: Reporter
 ) -> Detections:
-    """Return the detections in every frame, continuing from a checkpoint if there is one.
+    """Return the detections in every frame; the job resumes from a checkpoint if there is one.
 
     Raises:
         DataError: no frame shows any tracked marker; the message lists the visible markers.
@@ -79,10 +79,10 @@ def detect_all(
     log = {name: list(kept.get(name, ())) for name in KINDS}
     known, saved = len(log["frame"]), clock.monotonic()
     if known:
-        report.line(f"going on from frame {known}")
+        report.line(f"resuming at frame {known}")
     report.stage("tracking")
     before: Grey | None = None
-    # the last frame of the checkpoint is read again, to check whether the next one repeats it
+    # read the last frame of the checkpoint again, to check whether the next frame repeats it
     with closing(read_ahead(source.frames(max(0, known - 1)))) as frames:
         try:
             for frame in frames:
@@ -96,7 +96,7 @@ def detect_all(
                     log["time"].append(frame.time)
                     log["repeated"].append(repeated)
                     if len(log["frame"]) == FIRST_FRAMES and not log["row"]:
-                        report.line(_others(frame.grey, tracker) or "no marker in sight so far")
+                        report.line(_others(frame.grey, tracker) or "no marker detected so far")
                 before = frame.grey
                 if clock.monotonic() > saved + CHECKPOINT_S:
                     checkpoint.save(CHECKPOINT_NAME, vars(Detections.of(log)))
@@ -110,27 +110,27 @@ def detect_all(
             raise DataError(f"{source.name}: {sentence}")
         wanted = ", ".join(map(str, sorted(tracker.ids)))
         raise DataError(
-            f"{source.name}: marker {wanted} in none of {len(log['frame'])} frames; expected it "
-            "in view, sharp, flat, with a white margin around"
+            f"{source.name}: marker {wanted} in none of {len(log['frame'])} frames; expected the "
+            "marker in view, sharp, flat, with a white margin around it"
         )
     return Detections.of(log)
 
 
 def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
-    """Return advice if a picture shows markers, but none of the tracked ones; None otherwise."""
+    """Return advice if an image shows markers, but none of the tracked ones; None otherwise."""
     wanted = ", ".join(map(str, sorted(tracker.ids)))
     visible = {d.id for d in tracker.detector.detect(grey, tracker.region)}
     if others := sorted(visible - tracker.ids):
         return (
-            f"marker {wanted} is in no frame so far, but {_numbers(others)}; expected --id "
-            f"{others[0]}, or a file of targets"
+            f"marker {wanted} is in no frame so far, but {_numbers(others)} in view; expected "
+            f"--id {others[0]}, or a file of targets"
         )
     dictionary, numbers = visible_markers([cut(grey, tracker.region)])
     if not numbers:
         return None
     return (
         f"marker {wanted} is in no frame so far, but {_numbers(numbers)} of the dictionary "
-        f"{dictionary}; expected --dictionary {dictionary}"
+        f"{dictionary} in view; expected --dictionary {dictionary}"
     )
 
 
@@ -142,7 +142,7 @@ def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | 
     """Return the number of the only marker in the first frames of a video, or in a region of them.
 
     Raises:
-        DataError: these frames show no marker, or several.
+        DataError: these frames show no marker of the dictionary, or several.
     """
     counts: Counter[int] = Counter()
     last: Grey | None = None
@@ -157,16 +157,16 @@ def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | 
         return often[0]
     if often:
         raise DataError(
-            f"{source.name}: {_numbers(often)} in view; expected --id for the robot's, or a file "
-            "of targets"
+            f"{source.name}: {_numbers(often)} in view; expected --id with the number of the "
+            "robot's marker, or a file of targets"
         )
     dictionary, numbers = visible_markers([] if last is None else [cut(last, region)])
     if numbers:
         raise DataError(
-            f"{source.name}: no marker of this dictionary, but {_numbers(numbers)} of "
-            f"{dictionary}; expected --dictionary {dictionary}"
+            f"{source.name}: no marker of the requested dictionary, but {_numbers(numbers)} of "
+            f"{dictionary} in view; expected --dictionary {dictionary}"
         )
     raise DataError(
-        f"{source.name}: no marker of any dictionary in the first frames; expected one in view, "
-        "sharp, flat, with a white margin around, or --id where it comes later"
+        f"{source.name}: no marker of any dictionary in the first frames; expected a marker in "
+        "view, sharp, flat, with a white margin around it; if it comes into view later, give --id"
     )

@@ -1,16 +1,16 @@
-"""Detection of markers in frames, near their last place and periodically in the whole frame.
+"""Detection of markers in frames, near their last position and periodically in the whole frame.
 
-OpenCV searches a whole frame in tens of milliseconds and the surroundings of a marker in one. If
-every tracked marker was detected in the last frame and is detected again near its expected place,
-the rest of the frame is skipped. Every `WHOLE_INTERVAL`-th frame is searched completely, so that a
-second marker of the same number is detected.
+OpenCV searches a whole frame in tens of milliseconds, but the surroundings of a marker in one
+millisecond. If every tracked marker was detected in the last frame and is detected again near its
+expected position, the rest of the frame is skipped. Every `WHOLE_INTERVAL`-th frame is searched
+completely, so that a second marker of the same number is detected.
 
 Corners are refined to less than a pixel as intersections of straight lines fitted to the four
 edges. Refining each corner by itself is inaccurate for a small marker: the window around the corner
 contains the marker's inner pattern, which shifts all four corners in a way that looks like a
 rotation of the marker. An edge is visible over its whole length. Across it, from the black border
 to the white margin, brightness rises from one level to another, and the area below that profile
-gives the place of the edge for any blur by the lens or by motion.
+gives the position of the edge for any blur by the lens or by motion.
 """
 
 from dataclasses import dataclass, field
@@ -23,22 +23,23 @@ from slipid.camera.opencv import Grey, cv2, marker_dictionary, size_of
 WHOLE_INTERVAL = 30
 """Interval, in frames, at which the whole frame is searched."""
 MARGIN = 0.7
-"""Margin of the search region around a marker's expected place, relative to the marker's size in
-the picture [1]."""
+"""Margin of the search region around a marker's expected position, relative to the marker's size in
+the image [1]."""
 LEAST_MARGIN = 12.0
-"""Smallest margin of the search region [pixel]: the detector ignores markers at its border."""
+"""Smallest margin of the search region [pixel]; it is needed because the detector ignores markers
+at the region's border."""
 REFINEMENTS = 3
-"""Number of times that edges are sampled and corners refined, starting from corners with errors of
-about a pixel."""
+"""Number of iterations in which edges are sampled and corners refined, starting from corners with
+errors of about a pixel."""
 ALONG, ACROSS = 20, 11
-"""Number of places along an edge, and number of brightness samples across it at each place."""
+"""Number of brightness profiles along an edge, and number of samples across the edge in each."""
 END_SHARE = 0.12
 """Fraction of an edge's length that is not sampled at each end, near the next edge [1]."""
 SAMPLED_REACH = 0.6
 """Distance to which brightness is sampled on both sides of an edge, in squares of the marker [1];
-beyond one square lies the inner pattern."""
+it is below 1, since the inner pattern begins one square from the edge."""
 MOST_SAMPLED_REACH = 6.0
-"""Largest distance to which brightness is sampled [pixel]; more would only add noise."""
+"""Largest distance to which brightness is sampled [pixel]; a larger one would only add noise."""
 LEVEL_SAMPLES = 3
 """Number of outermost samples on each side whose median is the dark or the bright level."""
 LEAST_CONTRAST = 12.0
@@ -61,7 +62,7 @@ class Detection:
 
     @property
     def middle(self) -> Float[np.ndarray, "2"]:
-        """Mean place of the corners [pixel]."""
+        """Mean of the corners [pixel]."""
         return np.asarray(self.corners.mean(axis=0))
 
 
@@ -87,7 +88,7 @@ class Region:
 
 
 def cut(grey: Grey, region: Region | None) -> UInt8[np.ndarray, "down across"]:
-    """Return the part of a picture within a region, or the whole picture if the region is None."""
+    """Return the part of an image within a region, or the whole image if the region is None."""
     if region is None:
         return grey
     part = region.within(Region(0, 0, *size_of(grey)))
@@ -98,7 +99,7 @@ class MarkerDetector:
     """OpenCV's detector for markers of a dictionary, with corners refined to less than a pixel.
 
     Raises:
-        DataError: no dictionary has that name, or OpenCV is not installed.
+        DataError: no dictionary has the given name, or OpenCV is not installed.
     """
 
     def __init__(self, dictionary: str):
@@ -127,11 +128,11 @@ class MarkerTracker:
     Attributes:
         detector: detector of the markers.
         ids: numbers of the markers to track.
-        region: region of the picture to which detections are limited.
+        region: region of the image to which detections are limited.
         last: last detection of each marker to track.
         speed: motion of each marker's middle between the last two frames [pixel].
-        twice: whether a marker was detected twice in the last frame; the next frame is then
-            searched completely, so that the tracker does not follow the wrong one.
+        twice: True if a marker was detected twice in the last frame; the next frame is then
+            searched completely, so that the tracker does not follow the wrong marker.
     """
 
     detector: MarkerDetector
@@ -206,7 +207,8 @@ def refined(
 ) -> Float[np.ndarray, "marker 4 2"]:
     """Return corners refined to intersections of lines fitted to the markers' edges [pixel].
 
-    Corners of a marker without clear edges, or that would move too far, are returned unchanged.
+    The corners of a marker are returned unchanged if its edges are not clear, or if a corner would
+    move too far.
 
     Args:
         grey: the frame.
@@ -225,7 +227,7 @@ def refined(
 
 
 def _profiles(grey: Grey, edges: _Edges) -> Float[np.ndarray, "marker 4 along across"]:
-    """Return the brightness across each edge, from inside to outside, at places along the edge."""
+    """Return brightness profiles across each edge, from inside to outside of the marker."""
     along, across = np.linspace(END_SHARE, 1 - END_SHARE, ALONG), np.linspace(-1, 1, ACROSS)
     aside = edges.reach[..., None] * across
     places = (
@@ -245,7 +247,7 @@ def _offsets(
 ) -> Float[np.ndarray, "marker 4 2"]:
     """Return the outward offset of each edge's fitted line from the edge's start and end [pixel].
 
-    It is NaN if the two sides of the edge do not differ in brightness.
+    The offset is NaN if the two sides of the edge do not differ enough in brightness.
     """
     dark = np.median(profiles[..., :LEVEL_SAMPLES], axis=(-1, -2))
     bright = np.median(profiles[..., -LEVEL_SAMPLES:], axis=(-1, -2))
@@ -270,7 +272,7 @@ def _offsets(
 def _intersections(
     edges: _Edges, offsets: Float[np.ndarray, "marker 4 2"]
 ) -> Float[np.ndarray, "marker 4 2"]:
-    """Return the start of each edge: the intersection of its line with the line before [pixel]."""
+    """Return the start of each edge, where its fitted line meets the previous edge's [pixel]."""
     start = edges.start + edges.outward * offsets[..., :1]
     along = edges.start + edges.along + edges.outward * offsets[..., 1:] - start
     other, other_along = np.roll(start, 1, axis=1), np.roll(along, 1, axis=1)

@@ -1,10 +1,10 @@
-"""Output of tracked poses as a file that belongs to a log, and as a picture to check them by eye.
+"""Output of tracked poses: a file of poses to go with a log, and an image for a check by eye.
 
 The file is CSV or Parquet, with a row for each frame. Columns: frame; time [s]; x, y [m],
-heading [rad], empty if the frame has no pose; their covariance (var_x, var_y, var_heading,
-cov_xy, cov_x_heading, cov_y_heading) in products of [m, m, rad]; size, the apparent size of the
-markers divided by the true size [1]; rejected_x, rejected_y [m], rejected_heading [rad], a fitted
-but rejected pose; and flag, the name of a `slipid.camera.tracking.track.Flag`.
+heading [rad], empty if the frame has no pose; the covariance of the pose (var_x, var_y,
+var_heading, cov_xy, cov_x_heading, cov_y_heading) in products of [m, m, rad]; size, the apparent
+size of the markers divided by the true size [1]; rejected_x, rejected_y [m], rejected_heading
+[rad], a fitted but rejected pose; and flag, the name of a `slipid.camera.tracking.track.Flag`.
 """
 
 import io
@@ -35,21 +35,23 @@ def check_writable(path: Path) -> None:
     """Raise `DataError` unless poses can be written to a file.
 
     Raises:
-        DataError: the file cannot be written, would replace a file of another kind, or is Parquet
-            and pyarrow is not installed.
+        DataError: the file cannot be written, would replace a CSV file that holds no tracked poses,
+            or is Parquet and pyarrow is not installed.
     """
     suffix = path.suffix.lower()
     if path.is_dir():
         raise DataError(f"{path}: a folder; expected the name of a file, .csv or .parquet")
     if suffix not in (".csv", ".parquet"):
-        raise DataError(f"{path}: expected a name that ends in .csv or .parquet")
+        raise DataError(
+            f"{path}: not a name for a file of poses; expected one that ends in .csv or .parquet"
+        )
     if suffix == ".csv" and path.is_file():
         with path.open("rb") as file:
             head = file.read(len(_HEAD))
         if head not in (b"", _HEAD.encode()):
             raise DataError(
-                f"{path}: there is a file of another kind, which would be lost; expected another "
-                "name"
+                f"{path}: this file holds no tracked poses and would be overwritten; expected "
+                "another name"
             )
     if suffix == ".parquet":
         _pyarrow()
@@ -67,7 +69,7 @@ def write_poses(path: Path, track: TrackedPoses) -> None:
 
 
 def _columns(track: TrackedPoses) -> dict[str, np.ndarray]:
-    """Return the columns of `_FORMATS` keyed by name, with NaN for empty cells."""
+    """Return the columns listed in `_FORMATS`, keyed by name, with NaN for empty cells."""
     p, c, r = track.pose, track.covariance, track.rejected
     values = (
         *(track.time, p[:, 0], p[:, 1], p[:, 2]),
@@ -95,8 +97,8 @@ def _pyarrow() -> ModuleType:
         import pyarrow.parquet
     except ImportError as error:
         raise DataError(
-            f"Parquet needs {error.name}; expected: pip install 'slipid[parquet]', or a name that "
-            "ends in .csv"
+            f"Parquet needs {error.name}, which is not installed; expected: pip install "
+            "'slipid[parquet]', or a name that ends in .csv"
         ) from error
     return pyarrow
 
@@ -128,17 +130,17 @@ body that point ahead and to the left."""
 def write_preview(
     path: Path, grey: Grey, camera: OverheadCamera, tracks: tuple[TrackedPoses, ...], row: int
 ) -> None:
-    """Write a picture of a frame with a grid on the floor, the markers' edges and bodies' axes.
+    """Write a frame as an image with a floor grid, the markers' edges and the bodies' axes.
 
     Args:
         path: the PNG or JPEG file to write.
         grey: the frame.
-        camera: the camera that took it.
+        camera: the camera that took the frame.
         tracks: tracked poses of every body.
         row: row of the frame in the tracks.
 
     Raises:
-        DataError: the suffix is not that of a picture, or the file cannot be written.
+        DataError: the suffix is not that of an image, or the file cannot be written.
     """
     drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     _grid(drawn, camera)
@@ -149,10 +151,10 @@ def write_preview(
 
 
 def check_drawable(path: Path) -> None:
-    """Raise `DataError` unless a picture can be written to a file.
+    """Raise `DataError` unless an image can be written to a file.
 
     Raises:
-        DataError: the file cannot be written, or the suffix is not that of a picture.
+        DataError: the file cannot be written, or the suffix is not that of an image.
     """
     _encoded(path, np.zeros((8, 8, 3), np.uint8))
     writable(path.parent)
@@ -164,7 +166,10 @@ def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
     except cv2.error:
         there = False
     if not there:
-        raise DataError(f"{path}: not a picture that OpenCV writes; expected .png or .jpg")
+        raise DataError(
+            f"{path}: OpenCV writes no image with this suffix; expected a name that ends in .png "
+            "or .jpg"
+        )
     return bytes(data)
 
 
@@ -175,7 +180,7 @@ def _line(
     colour: tuple[int, int, int],
     width: int,
 ) -> None:
-    """Draw a line through points in the world [m], unless it lies far outside the picture."""
+    """Draw a line through points in the world [m], unless one of them is far off the image."""
     pixels = camera.pixels(points)
     if np.isfinite(pixels).all() and (np.abs(pixels) < 1e5).all():
         whole = np.round(pixels).astype(np.int32).reshape(-1, 1, 2)
@@ -189,7 +194,8 @@ def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
     floor = camera.on_plane(frame.reshape(-1, 2), 0.0)
     floor = floor[np.isfinite(floor).all(axis=1)]
     low, high = floor.min(axis=0), floor.max(axis=0)
-    high = np.minimum(high, low + 100 * GRID_M)  # a tilted camera may see the horizon
+    # a tilted camera may see floor up to the horizon: draw at most 100 lines along each axis
+    high = np.minimum(high, low + 100 * GRID_M)
     lines = [np.arange(np.ceil(low[k] / GRID_M), high[k] / GRID_M) * GRID_M for k in range(2)]
     for axis in range(2):
         along = np.linspace(low[1 - axis], high[1 - axis], 40)
@@ -206,7 +212,7 @@ def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
 def _label(
     drawn: np.ndarray, camera: OverheadCamera, place: Float[np.ndarray, "3"], text: str
 ) -> None:
-    """Write text next to a place on the floor [m], if the place lies in the picture."""
+    """Write text next to a point on the floor [m], if the point lies in the image."""
     x, y = camera.pixels(place[None])[0].tolist()
     width, height = camera.lens.image_px
     if 0 <= x < width and 0 <= y < height:
@@ -217,7 +223,7 @@ def _label(
 def _body(
     drawn: np.ndarray, camera: OverheadCamera, track: TrackedPoses, pose: Float[np.ndarray, "3"]
 ) -> None:
-    """Draw the markers' edges expected at a pose, and the body's axes, x red and y green."""
+    """Draw the markers' edges as computed from a pose, and the body's axes, x red and y green."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     place = np.array([pose[0], pose[1], 0.0])

@@ -1,19 +1,19 @@
 """The pose of a body on the floor, with its covariance, from the corners of its markers.
 
-The pixel of every corner determines a ray that meets the plane at the corner's height. There the
-corners i of a body at x, y [m] with heading theta [rad], whose markers appear s times as large as
-they are, lie at
+The pixel of every corner determines a ray that meets the plane at the corner's height. On that
+plane, a body at x, y [m] with heading theta [rad], whose markers appear s times as large as they
+are, has its corner i at
 
     place_i = (x, y) + R(theta) (middle_i + s own_i)                                         (1)
 
-where middle_i is the middle of the corner's marker on the body, own_i the vector from there to the
-corner [m], and R(theta) the rotation by theta. The fit minimises residuals in pixels, into which
-residuals on the plane are converted by the local derivative of the ray's place. The factor s is
-fitted because the edge between black and white is detected slightly inside or outside its true
-place, equally at all corners. s absorbs that error, and reveals a wrong height of the markers. It
-does not scale the vector from the body's origin to a marker, which was measured with a ruler. If
-the errors of corners are independent, with a std of sigma [pixel], the covariance of
-(x, y, theta, s) is sigma^2 (J^T J)^-1, with J the derivative of the residuals [pixel].
+where middle_i is the middle of the corner's marker in the body's axes [m], own_i the vector from
+that middle to the corner [m], and R(theta) the rotation by theta. The fit minimises residuals in
+pixels; residuals on the plane are converted to pixels by the local derivative of the point where
+the ray meets the plane. The factor s is fitted because the edge between black and white is detected
+slightly inside or outside its true position, equally at all corners. s absorbs that error, and
+reveals a wrong height of the markers. It does not scale middle_i, which was measured with a ruler.
+If the errors of corners are independent, with a std of sigma [pixel], the covariance of
+(x, y, theta, s) is sigma^2 (J^T J)^-1, where the matrix J holds the derivatives of the residuals.
 """
 
 from dataclasses import dataclass
@@ -25,10 +25,10 @@ from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.target import Target
 
 GAUSS_NEWTON_STEPS = 3
-"""Number of Gauss-Newton steps; few suffice, since the start is exact except for the effect of the
-camera's tilt."""
+"""Number of Gauss-Newton steps; few suffice, since the start is already the least-squares solution
+in metres, see `_similarity`."""
 PIXEL_STEP = 0.5
-"""Step of the numerical derivative of a ray's place by the pixel [pixel]."""
+"""Step of the numerical derivative of floor coordinates with respect to pixels [pixel]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,11 @@ class FittedPoses:
 
     Attributes:
         pose: x, y [m], heading [rad] between -pi and pi.
-        unit_covariance: covariance of the pose if the std of corners is one pixel, in products of
-            [m/pixel, m/pixel, rad/pixel].
+        unit_covariance: covariance of the pose if corners have errors with a std of one pixel, in
+            products of [m/pixel, m/pixel, rad/pixel].
         size: apparent size of the markers divided by their true size [1].
         squares: sum of the squared residuals [pixel^2].
-        free: degrees of freedom of that sum: two for each detected corner, less four.
+        free: degrees of freedom of `squares`: two for each detected corner, less four.
     """
 
     pose: Float[np.ndarray, "frame 3"]
@@ -56,7 +56,7 @@ class _Corners:
     """All corners of a target.
 
     Attributes:
-        middle: middle of the corner's marker on the body, x ahead and y left [m].
+        middle: middle of the corner's marker in the body's axes, x ahead and y left [m].
         own: vector from that middle to the corner [m].
         height: height of the corner above the floor [m].
     """
@@ -79,7 +79,7 @@ def poses_of(
     """Return the poses of a body, fitted to the detected corners of its markers.
 
     Args:
-        camera: camera with its place above the floor.
+        camera: camera with a calibrated pose above the floor.
         target: the body, with its markers in the order of `corners`.
         corners: x, y of the corners [pixel], NaN where a marker was not detected.
     """
@@ -116,7 +116,7 @@ def _on_planes(
     pixels: Float[np.ndarray, "frame corner 2"],
     heights: Float[np.ndarray, " corner"],
 ) -> tuple[Float[np.ndarray, "frame corner 2"], Float[np.ndarray, "frame corner 2 2"]]:
-    """Return places of corners at their heights [m], and their derivatives by pixels [m/pixel]."""
+    """Return x, y of corners at their heights [m], and the derivatives [m/pixel] by pixel u, v."""
     place = np.full(pixels.shape, np.nan)
     slope = np.full((*pixels.shape, 2), np.nan)
     for height in np.unique(heights):
@@ -138,7 +138,7 @@ def _similarity(
 ) -> Float[np.ndarray, "frame 4"]:
     """Return x, y [m], heading [rad] and size [1] by least squares in metres, in closed form.
 
-    Unlike in equation (1), the size scales the whole body.
+    The result is a start value for equation (1): here the size scales the whole body.
     """
     weight = used / used.sum(axis=1, keepdims=True)
     z, c = place[..., 0] + 1j * place[..., 1], body[:, 0] + 1j * body[:, 1]
@@ -157,9 +157,10 @@ def _residuals(
     body: _Corners,
     used: Bool[np.ndarray, "frame corner"],
 ) -> tuple[Float[np.ndarray, "frame number"], Float[np.ndarray, "frame number 4"]]:
-    """Return the residuals, places by equation (1) less measured ones [pixel], and derivatives.
+    """Return residuals, computed by equation (1) less measured [pixel], and their derivatives.
 
-    Derivatives are by x, y, heading and size; both results are 0 for unused corners.
+    Derivatives are with respect to x, y, heading and size. Residuals and derivatives are 0 for
+    unused corners.
     """
     own, size = _turned(body.own, fitted[:, 2]), fitted[:, 3, None, None]
     turned = _turned(body.middle, fitted[:, 2]) + size * own

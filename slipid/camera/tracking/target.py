@@ -1,8 +1,9 @@
-"""Targets to track: bodies with markers, specified by dictionary, number, size and place.
+"""Targets to track: bodies with markers, specified by dictionary, number, size and position.
 
-A single marker without a file of targets lies in the middle of the body with its top edge ahead, so
-that the heading is the direction from its bottom edge to its top edge as the dictionary defines
-them. A file of targets can place several markers, or boards of markers, anywhere on a body:
+Without a file of targets, a body has a single marker in its middle with the top edge ahead, so that
+the heading is the direction from the marker's bottom edge to its top edge, as the dictionary
+defines these edges. A file of targets can put several markers, or boards of markers, anywhere on a
+body:
 
     [[target]]
     name = "robot"
@@ -70,7 +71,7 @@ class Marker:
             id: number of the marker in its dictionary.
             size: edge length of its black square [m].
             height: height above the floor [m].
-            place: its middle on the body, x ahead and y left [m].
+            place: position of its middle on the body, x ahead and y left [m].
             yaw: direction of its top edge, counter-clockwise from ahead [rad].
         """
         ahead_left = 0.5 * size * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
@@ -98,7 +99,7 @@ class Target:
         return float(np.mean([marker.corners[:, 2] for marker in self.markers]))
 
     def below(self, camera_m: float) -> None:
-        """Raise `DataError` unless all markers are below the camera, at a height `camera_m` [m].
+        """Raise `DataError` unless all markers are lower than the camera's height `camera_m` [m].
 
         Raises:
             DataError: a marker is as high as the camera, or higher.
@@ -106,13 +107,13 @@ class Target:
         for marker in self.markers:
             if (height := float(marker.corners[:, 2].max())) >= camera_m:
                 raise DataError(
-                    f"{self.name}: marker {marker.id} at {height:g} m above the floor, but the "
-                    f"camera at {camera_m:g} m; expected heights in metres, below the camera"
+                    f"{self.name}: marker {marker.id} is {height:g} m above the floor, but the "
+                    f"camera {camera_m:g} m; expected a marker height in metres, below the camera"
                 )
 
 
 class _Placed(Section):
-    """Size and place of a marker or a board on the body."""
+    """Size, position and direction of a marker or a board on the body."""
 
     size_m: Positive
     height_m: FiniteFloat
@@ -168,8 +169,8 @@ def read_targets(path: Path) -> tuple[Target, ...]:
     """Return the targets in a TOML file.
 
     Raises:
-        DataError: the file is unreadable or wrong, a target has no marker, a number or a name
-            occurs twice, or dictionaries differ.
+        DataError: the file is unreadable or has wrong keys or values, a target has no marker, a
+            marker or a name occurs twice, or dictionaries differ.
     """
     given = checked(path, mapping_of(path, text_of(path, "targets to track")), _TargetsFile)
     targets = tuple(_target(one, f"{path}: target '{one.name}'") for one in given.target)
@@ -195,12 +196,14 @@ def _target(given: _Target, where: str) -> Target:
 
 
 def _check_distinct(targets: Sequence[Target], where: str) -> None:
-    """Raise `DataError` if a number or a name occurs twice, or dictionaries differ."""
+    """Raise `DataError` if a marker or a name occurs twice, or dictionaries differ."""
     if len({target.name for target in targets}) < len(targets):
-        raise DataError(f"{where}: two targets with one name; expected different names")
+        raise DataError(f"{where}: two targets have the same name; expected different names")
     if len({target.dictionary for target in targets}) > 1:
-        raise DataError(f"{where}: targets in several dictionaries; expected one for all")
+        raise DataError(
+            f"{where}: targets with several dictionaries; expected the same dictionary in all"
+        )
     ids = [marker.id for target in targets for marker in target.markers]
     for k, number in enumerate(ids):
         if number in ids[:k]:
-            raise DataError(f"{where}: marker {number} twice; expected every number once")
+            raise DataError(f"{where}: marker {number} occurs twice; expected every number once")

@@ -1,11 +1,11 @@
 """Tracked poses of a body, each with its covariance, and rejected frames with the reason.
 
-A pose that no body can drive through is an outlier. Since a body has inertia, its place and speed
-limit where it can be a short time later. A track is cut into segments wherever it turns more
-sharply than that allows. The chain of segments that a body can drive one after the other, and that
-has the largest number of poses, is kept. The poses of all other segments are rejected as false
-detections, such as a reflection, a torn frame or frames out of order; they may last for one frame
-or for many.
+A pose that no body can drive through is an outlier. Since a body has inertia, its pose and speed
+limit where it can be a short time later. The sequence of poses is cut into segments wherever its
+motion changes more suddenly than these limits allow. Of all chains of segments that a body can
+drive one after the other, the chain with the largest number of poses is kept. The poses of all
+other segments are rejected as false detections, such as a reflection, a torn frame or frames out of
+order; these may last for one frame or for many.
 """
 
 from dataclasses import dataclass
@@ -20,24 +20,24 @@ from slipid.camera.tracking.pose import poses_of
 from slipid.camera.tracking.target import Target
 
 ACCELERATION = np.array([3.0, 3.0, 30.0])
-"""Largest acceleration accepted, more than a wheeled robot has: x, y [m/s^2], heading [rad/s^2]."""
+"""Largest accepted acceleration, above that of wheeled robots: x, y [m/s^2], heading [rad/s^2]."""
 SUDDEN_CHANGE = np.array([0.1, 0.1, 2.0])
-"""Largest sudden change of speed accepted, as in a collision: x, y [m/s], heading [rad/s]."""
+"""Largest accepted sudden change of speed, as in a collision: x, y [m/s], heading [rad/s]."""
 SPEED = np.array([5.0, 5.0, 15.0])
-"""Largest speed accepted, more than a wheeled robot has: x, y [m/s], heading [rad/s]."""
+"""Largest accepted speed, above that of wheeled robots: x, y [m/s], heading [rad/s]."""
 NOISE_STDS = 6.0
 """Deviation below which no pose is an outlier, in stds of the noise [1]."""
 POSES_BEHIND = 2
-"""Number of poses over which the speed at an end of a segment is computed."""
+"""Largest number of steps between poses over which the speed at a segment's end is computed."""
 SEGMENTS_BEHIND = 60
-"""Number of earlier segments among which the predecessor of a segment in the chain is searched."""
+"""Number of preceding segments that are tried as a segment's predecessor in the chain."""
 FEWEST_POSES = 5
 """Number of poses below which outliers cannot be recognised."""
 
 
 @dataclass(frozen=True, eq=False)
 class _NoisyPoses:
-    """Poses without missing ones: time [s], x, y [m] and heading [rad], and stds of their noise."""
+    """Poses of the frames that have one: time [s], x, y [m], heading [rad], and noise stds."""
 
     time: Float[np.ndarray, " pose"]
     pose: Float[np.ndarray, "pose 3"]
@@ -49,9 +49,9 @@ def jumps(
     pose: Float[np.ndarray, "frame 3"],
     std: Float[np.ndarray, "frame 3"],
 ) -> Bool[np.ndarray, " frame"]:
-    """Return a mask of the frames whose pose no body can drive through.
+    """Return a mask of the frames whose pose no body can drive through; see the module's text.
 
-    Frames without a pose are not among them.
+    The mask is False for frames without a pose.
 
     Args:
         time: increasing time [s].
@@ -75,7 +75,7 @@ def jumps(
 def _segments(poses: _NoisyPoses) -> Int[np.ndarray, " segment"]:
     """Return the index of the first pose of each segment.
 
-    A pose that does not fit between its neighbours becomes a segment of its own.
+    A pose that is inconsistent with its neighbours becomes a segment of its own.
     """
     t, p, s = poses.time, poses.pose, poses.std
     since, until = (t[1:-1] - t[:-2])[:, None], (t[2:] - t[1:-1])[:, None]
@@ -93,10 +93,10 @@ def _segments(poses: _NoisyPoses) -> Int[np.ndarray, " segment"]:
 def _longest_path(
     poses: _NoisyPoses, first: Int[np.ndarray, " segment"], last: Int[np.ndarray, " segment"]
 ) -> list[int]:
-    """Return the chain of segments with the largest number of poses, in reverse order of time.
+    """Return the indices of the segments in the drivable chain with the most poses, latest first.
 
-    A body can drive its segments one after the other. `first` and `last` are the indices of the
-    first and the last pose of each segment.
+    In a drivable chain a body can get from each segment to the next, see `_sharpness`. `first` and
+    `last` are the indices of the first and the last pose of each segment.
     """
     total = last - first + 1
     before = np.full(len(first), -1)
@@ -128,9 +128,9 @@ def _sharpness(
     base: Int[np.ndarray, " path"],
     to: Int[np.ndarray, " path"],
 ) -> Float[np.ndarray, " path"]:
-    """Return the change of motion from a pose to another, relative to the limits of a body [1].
+    """Return the change of motion that reaching a pose needs, relative to a body's limits [1].
 
-    A body can drive a path where the result is at most 1.
+    A body can drive a path if the result is at most 1.
 
     Args:
         poses: all poses.
@@ -167,9 +167,9 @@ class Flag(IntEnum):
         OK: the frame has a pose.
         MISSING: none of the body's markers was detected.
         AMBIGUOUS: a marker was detected twice.
-        REPEATED: the picture is identical to that of the frame before.
+        REPEATED: the image is identical to that of the frame before.
         SHAPE: the corners do not have the shape of a marker of the given size.
-        JUMP: the pose does not fit the poses of other frames.
+        JUMP: no body could drive through this pose and those of other frames.
     """
 
     OK = 0
@@ -186,23 +186,23 @@ class Flag(IntEnum):
 
 
 LEAST_CORNER_STD = 0.05
-"""Smallest std assumed for the error of a corner [pixel]; a smaller estimate is not credible."""
+"""Smallest std assumed for the error of a corner [pixel]; smaller estimates are not credible."""
 SHARED_STD = 0.05
 """Std of the error that all corners of a frame share, which residuals do not show [pixel]."""
 ODD_SQUARES = 25.0
 """Mean squared residual of a frame, relative to the median over frames, above which its corners do
 not have the shape of a marker [1]."""
 ODD_LEAST = 1.0
-"""Root mean square residual of a frame below which its corners are accepted for any median
-[pixel]. Residuals vary with heading, since an edge along the pixels' rows is located better than a
-slanted one."""
+"""Root mean square residual of a frame up to which its corners are accepted whatever the median is
+[pixel]. The limit is needed because residuals vary with heading: an edge along the rows of pixels
+is located better than a slanted edge."""
 ODD_SIZE = 0.05
 """Largest relative difference of the markers' size in a frame from its median over frames [1]."""
 WRONG_SIZE = 0.02
-"""Largest relative difference of the median apparent size from the true one; a larger one shows a
-wrong height or size of the markers [1]."""
+"""Largest relative difference of the median apparent size from the true size [1]; a larger
+difference means that the markers' height or size is wrong."""
 LEAST_TRACKED = 0.5
-"""Fraction of frames with a pose below which a result is doubtful [1]."""
+"""Fraction of frames with a pose below which a result is reported as doubtful [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,9 +217,9 @@ class TrackedPoses:
         rejected: the fitted pose of a rejected frame [m, m, rad], else NaN.
         flag: state of the frame, the number of a `Flag`.
         size: apparent size of the markers divided by their true size [1].
-        corner_std: std of the error of a corner, from the residuals [pixel].
-        apparent_height: height of the markers above the floor that follows from their size in the
-            picture [m].
+        corner_std: std of the error of a corner, estimated from the residuals [pixel].
+        apparent_height: height of the markers above the floor, computed from their size in the
+            image [m].
     """
 
     target: Target
@@ -257,19 +257,20 @@ class TrackedPoses:
         name, out = self.target.name, []
         if self.share < LEAST_TRACKED:
             out.append(
-                f"{name}: {self.good.sum()} of {len(self.flag)} frames have a pose; the others "
-                "say in column 'flag' why not"
+                f"{name}: only {self.good.sum()} of {len(self.flag)} frames have a pose; column "
+                "'flag' gives the reason for each other frame"
             )
         if self.count(Flag.AMBIGUOUS) > (1 - LEAST_TRACKED) * len(self.flag):
             out.append(
                 f"{name}: its marker is detected twice in {self.count(Flag.AMBIGUOUS)} frames "
-                "(another robot, a mirror?); --region keeps to a part of the picture"
+                "(another robot, a mirror?); limit tracking to a part of the image with --region"
             )
         if abs(self.median_size - 1) > WRONG_SIZE:
             out.append(
-                f"{name}: markers look {100 * (self.median_size - 1):+.1f} % larger than they are, "
-                f"at {self.target.height:g} m above the floor; if their size is right they are at "
-                f"{self.apparent_height:.3f} m, and every path length is wrong by about as much"
+                f"{name}: markers appear {100 * (self.median_size - 1):+.1f} % larger than they "
+                f"are, at {self.target.height:g} m above the floor; if their size is right, they "
+                f"are at {self.apparent_height:.3f} m, and every path length is wrong by about the "
+                "same percentage: measure size and height again"
             )
         return out
 
@@ -278,14 +279,14 @@ class TrackedPoses:
         text = f"{self.target.name}: {int(self.good.sum())} of {len(self.flag)} frames have a pose"
         others = [flag for flag in Flag if flag is not Flag.OK and self.count(flag)]
         if others:
-            text += f" (others: {', '.join(f'{self.count(f)} {f.word}' for f in others)})"
+            text += f" (without a pose: {', '.join(f'{self.count(f)} {f.word}' for f in others)})"
         if not self.good.any():
             return text
         std = np.sqrt(np.diagonal(self.covariance[self.good], axis1=1, axis2=2).mean(axis=0))
         return (
             f"{text}; std {1e3 * max(std[0], std[1]):.2f} mm and {np.degrees(std[2]):.3f} deg, "
-            f"corners err by {self.corner_std:.2f} pixel; size in the picture implies a height of "
-            f"{self.apparent_height:.3f} m ({self.target.height:g} stated)"
+            f"corners err by {self.corner_std:.2f} pixel; size in the image implies a height of "
+            f"{self.apparent_height:.3f} m (given: {self.target.height:g} m)"
         )
 
 

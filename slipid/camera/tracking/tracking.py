@@ -1,4 +1,4 @@
-"""`slipid track`: poses of marked bodies from a video, a folder of pictures or a camera."""
+"""`slipid track`: poses of marked bodies from a video, a folder of images or a camera."""
 
 from contextlib import closing
 from dataclasses import dataclass
@@ -47,9 +47,9 @@ class TrackingResult:
     checkpoint: Checkpoint
 
     def write(self, path: Path) -> list[Path]:
-        """Write the poses to a file and return the files written.
+        """Write the poses to a file, remove the checkpoint, and return the files written.
 
-        Each of several bodies has a file of its own, with the body's name added to the file name.
+        If there are several bodies, each one gets its own file, whose name ends in the body's name.
         """
         names = [path]
         if len(self.tracks) > 1:
@@ -95,16 +95,17 @@ def track(
 
     Args:
         source: the frames, see `open_source`.
-        camera: calibrated camera with its place above the floor.
+        camera: calibrated camera with its pose above the floor.
         targets: the bodies and their markers, all of one dictionary.
         checkpoint: folder of the checkpoint from which an interrupted job resumes; it is removed
             once the poses are written.
         report: receives the progress.
-        region: region of the picture to which detections are limited.
+        region: region of the image to which detections are limited.
 
     Raises:
-        DataError: frames do not have the size at which the camera was calibrated, no frame shows a
-            marker of the bodies, or times do not increase.
+        DataError: frames do not have the size at which the camera was calibrated, a marker is not
+            below the camera, the region is outside the image, no frame shows a marker of the
+            bodies, or times do not increase.
     """
     camera.lens.check_size(source.image_px, source.name)
     for target in targets:
@@ -112,7 +113,9 @@ def track(
     ids = frozenset(number for target in targets for number in target.ids)
     if region is not None and region.within(Region(0, 0, *camera.lens.image_px)).empty:
         width, height = camera.lens.image_px
-        raise DataError(f"--region is outside the picture; expected part of 0,0,{width},{height}")
+        raise DataError(
+            f"--region is outside the image; expected a region within 0,0,{width},{height}"
+        )
     dictionary = targets[0].dictionary
     kept = Checkpoint(
         checkpoint,
@@ -139,15 +142,15 @@ def check_outputs(source: FrameSource, out: Path, preview: Path | None) -> None:
     """Raise `DataError`, before the tracking starts, unless its results can be written.
 
     Raises:
-        DataError: a file cannot be written, or a preview of a device is requested, whose frames
-            cannot be read again.
+        DataError: a file cannot be written, or a preview is requested of a device, since a device's
+            frames cannot be read again.
     """
     check_writable(out)
     if preview is not None:
         if isinstance(source, Device):
             raise DataError(
-                f"{source.name}: --preview of a device, whose frames are not kept; expected a "
-                "video or a folder of pictures"
+                f"{source.name}: --preview is not possible for a device, whose frames are not "
+                "kept; expected a video or a folder of images, or no --preview"
             )
         check_drawable(preview)
 
@@ -159,7 +162,7 @@ class LoneMarker:
     Attributes:
         size: edge length of its black square [m].
         height: height of the marker above the floor [m].
-        id: number of the marker; None for the only one in view.
+        id: number of the marker; None for the only marker in view.
         dictionary: name of its dictionary.
         yaw: direction of its top edge, counter-clockwise from ahead [rad].
     """
@@ -172,10 +175,13 @@ class LoneMarker:
 
     def __post_init__(self) -> None:
         if not 0 < self.size < np.inf:
-            raise DataError(f"--marker-size {self.size:g}; expected the edge in metres")
+            raise DataError(
+                f"--marker-size {self.size:g}; expected the edge length of the black square in "
+                "metres"
+            )
         if not 0 <= self.height < np.inf:
             raise DataError(
-                f"--marker-height {self.height:g}; expected it in metres above the floor"
+                f"--marker-height {self.height:g}; expected the height above the floor in metres"
             )
         if not np.isfinite(self.yaw):
             raise DataError(f"--marker-yaw {np.degrees(self.yaw):g}; expected an angle in degrees")
@@ -184,10 +190,12 @@ class LoneMarker:
             raise DataError(f"--id {self.id}; expected 0 to {most} in {self.dictionary}")
 
     def target(self, source: FrameSource, region: Region | None = None) -> Target:
-        """Return the body; a marker without a number is searched in the frames, or in a region.
+        """Return the body with its marker.
+
+        If the marker has no number, the first frames, or a region of them, are searched for it.
 
         Raises:
-            DataError: no marker is in view, or several are.
+            DataError: no marker is in view, or several are in view.
         """
         number = self.id
         if number is None:
@@ -200,7 +208,7 @@ def preview(path: Path, result: TrackingResult, camera: OverheadCamera, number: 
     """Draw the tracked poses into one frame, and return the number of that frame.
 
     Args:
-        path: the picture to write.
+        path: the image to write.
         result: tracked poses.
         camera: the camera that took the video.
         number: number of the frame; by default the first in which every body has a pose.

@@ -1,1 +1,1 @@
-"""Parts of the estimator: wheels, floors under them, effects of floors, the pose and its fixes."""
+"""Parts of the estimator: wheels, floors under the wheels, effects of floors, pose and fixes."""

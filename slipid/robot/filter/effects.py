@@ -2,20 +2,22 @@
 
 An effect is a constant error of the model on a floor: motion along, across and in yaw that the
 model does not predict, per metre that the wheels would roll without slip [m/m, m/m, rad/m]. It
-belongs to a floor and to a direction of travel u, the unit vector of the twist without slip, its
-yaw rate multiplied by the base radius. Its estimates from the fitted runs, a mean and a remaining
-std, are a table over directions and speeds (`EffectLookup`). An effect e, in units of its remaining
-std, decorrelates as the direction changes, and once the robot has left the floor:
+belongs to a floor and to a direction of travel u: the unit vector of the twist without slip, whose
+yaw rate is multiplied by the base radius first. A table over directions and speeds (`EffectLookup`)
+holds the mean of the effects estimated from the fitted runs, and the std that remains. An effect e,
+less its mean and in units of its remaining std, decorrelates as the direction changes, and once the
+robot has left the floor:
 
     a = exp(-far / SETTLING_LENGTH)
     k = exp(-(1 - a^2) |u - v|^2 / (2 DIRECTION_STD^2) - left far / LEAVING_LENGTH)
     e <- k e + sqrt(1 - k^2) noise,   v <- u + a (v - u)
 
-with `far` the path length of the step [m], v the settled direction, a low-pass filtered u, and
-`left` 1 if no wheel is on the floor, else 0. If the direction changes at once from v to u, the
-correlation becomes exp(-|u - v|^2 / (2 DIRECTION_STD^2)), in however many steps it is computed;
-jitter of the direction barely changes it, and on a drive back the effect is independent of the
-earlier one. Along an arc of curvature c [1/m] on which the direction turns by an angle [rad] the
+where `far` is the path length of the step [m], k the correlation of the effect over the step, v the
+settled direction (u after a low-pass filter), and `left` is 1 if no wheel is on the floor, else 0.
+If the direction changes at once from v to u, the correlation becomes
+exp(-|u - v|^2 / (2 DIRECTION_STD^2)), in however many steps it is computed. Jitter of the direction
+barely changes the correlation, and on a drive back the effect is independent of the effect on the
+way out. Along an arc of curvature c [1/m] on which the direction turns by an angle [rad], the
 correlation falls more slowly, to about exp(-angle c SETTLING_LENGTH / DIRECTION_STD^2): after a
 quarter turn on a radius of one metre it is a fifth.
 """
@@ -27,15 +29,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 DIRECTION_STD = 0.17
-"""Width of the Gaussian over changes of direction with which an effect decorrelates [rad]: 10 deg,
-estimated from real logs."""
+"""Width sigma of the Gaussian over changes of direction with which an effect decorrelates [rad];
+10 deg were estimated from real logs."""
 SETTLING_LENGTH = 0.03
 """Path length constant of the low-pass filter of the direction of travel [m]."""
 LEAVING_LENGTH = 0.1
 """Path length off a floor over which its effect decorrelates by a factor of e [m]."""
 LOG_SPEED_STD = 0.5
-"""Width of the Gaussian over log speed with which estimates fade to 0 outside the speeds of the
-table [1]; the fit uses the same value."""
+"""Width sigma of the Gaussian over log speed with which the table's means fade to 0 outside its
+range of speeds [1]; the fit uses the same value."""
 TRAVEL_SHARE = 0.2
 """Ratio of translational speed to `RolledMotion.speed` above which a robot counts as travelling in
 a direction, not as turning on the spot [1]; the fit uses the same value."""
@@ -46,7 +48,7 @@ class RolledMotion(eqx.Module):
 
     Attributes:
         speed: speed of the body plus base radius times its absolute yaw rate [m/s].
-        axes: directions along, across and in yaw, as columns in the body frame.
+        axes: unit vectors along, across and in yaw, as columns in the body frame.
         straight: translational speed of the body [m/s].
         angle: direction of travel in the body frame [rad].
         travels: True if the body travels in a direction rather than turning on the spot.
@@ -60,7 +62,7 @@ class RolledMotion(eqx.Module):
 
     @classmethod
     def of(cls, rolling: Float[Array, "3"], base: Float[Array, ""]) -> "RolledMotion":
-        """Return the motion of a twist without slip, for a base radius [m]."""
+        """Return the motion for the twist without slip `rolling` and the base radius `base` [m]."""
         straight = jnp.sqrt(rolling[:2] @ rolling[:2] + 1e-24)
         speed = straight + base * jnp.abs(rolling[2])
         u = jnp.where(straight > 1e-6, rolling[:2] / straight, jnp.array([1.0, 0.0]))
@@ -74,12 +76,12 @@ class RolledMotion(eqx.Module):
 
 
 class EffectLookup(eqx.Module):
-    """Effects of every floor estimated from the fitted runs, at evenly spaced directions.
+    """Table of the effects estimated from the fitted runs, at evenly spaced directions.
 
     Attributes:
-        log_speed: rising logarithms of the table's speeds [m/s].
-        table: mean effect along, across [m/m] and in yaw [rad/m], then for each of the three the
-            remaining std as a fraction of the whole std [1].
+        log_speed: logarithms of the table's speeds [m/s], in rising order.
+        table: mean effect along, across [m/m] and in yaw [rad/m], then the remaining std of each of
+            the three as a fraction of its std without a table [1].
     """
 
     log_speed: Float[Array, " speed"]
@@ -87,15 +89,15 @@ class EffectLookup(eqx.Module):
 
     @classmethod
     def empty(cls, floors: int) -> "EffectLookup":
-        """Return the table of effects without estimates: mean 0 and the whole std remaining."""
+        """Return a table without estimates: means are 0, remaining fractions of stds are 1."""
         rows = np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 1.0], (floors, 1, 1, 1))
         return cls(jax.device_put(np.zeros(1)), jax.device_put(rows))
 
     def at(self, rolled: RolledMotion) -> tuple[Float[Array, "floor 3"], Float[Array, "floor 3"]]:
-        """Return the mean effect on every floor, and the remaining fraction of its std.
+        """Return the mean effect on every floor, and the remaining fraction of the effect's std.
 
-        The table is interpolated linearly over directions and speeds; outside the range of its
-        speeds the estimates fade to 0.
+        The table is interpolated linearly over directions and speeds. Outside its range of speeds,
+        and while the robot turns on the spot, means fade to 0 and fractions to 1.
         """
         around = self.table.shape[2]
         place = jnp.mod(rolled.angle / (2 * jnp.pi), 1.0) * around
@@ -109,9 +111,9 @@ class EffectLookup(eqx.Module):
         return fade * row[:, :3], jnp.sqrt(1 - fade**2 * (1 - row[:, 3:] ** 2))
 
     def _speeds(self, log_speed: Array) -> tuple[Array, Array, Array]:
-        """Return the table's rows next to a log speed, their weights, and the excess.
+        """Return the table's two rows next to a log speed, their weights, and the excess.
 
-        The excess is the signed distance of the log speed from the table's range, 0 inside.
+        The excess is the signed distance of the log speed from the table's range; it is 0 inside.
         """
         rows = self.log_speed
         within = jnp.clip(log_speed, rows[0], rows[-1])
@@ -137,12 +139,12 @@ def effect_correlation(
     left: Float[Array, " floor"],
     far: Float[Array, ""],
 ) -> tuple[Float[Array, "3"], Float[Array, " floor"]]:
-    """Return the settled direction after a step, and the effects' correlation over it by floor.
+    """Return the settled direction after a step, and each floor's correlation k over the step.
 
     Args:
-        before: settled direction before the step, zeros at the start.
-        now: direction of the step.
-        left: probability that no wheel is on the floor [1].
+        before: settled direction before the step; zeros at the start.
+        now: direction of travel in the step.
+        left: probability that no wheel is on each floor [1].
         far: path length of the step [m].
     """
     a = jnp.exp(-far / SETTLING_LENGTH)

@@ -1,20 +1,21 @@
 """A floor map for jitted functions, and its evidence about floors and pose.
 
 With a map, the estimated pose and its covariance determine which floors are likely under the
-wheels. Poses x_s are a fixed set of samples, scaled by the root of the covariance. The map gives
-the probability W_sc of every hypothesis c (one floor under each wheel) at each pose x_s; the mean
-over poses is the prior of c. [...] is 1 if its content is true, else 0:
+wheels. Pose samples x_s are a fixed set of standard samples, scaled by the root of the covariance.
+The map gives the probability W_sc of every hypothesis c (a floor for each wheel) at each sample
+x_s; the mean over samples is the prior of c. [...] is 1 if its content is true, else 0, and `leak`
+is `MAP_ERROR`:
 
     W_sc ~ prod_wheel ((1 - leak) [map at the wheel of x_s is c's] + leak / floors),  sum_c W_sc = 1
     prior_c = mean_s W_sc
 
 Currents and gyro of a step change the probability of a hypothesis from p_c to p_c'. This in turn
-changes the probability of each pose (`slipid.robot.filter.pose_fix.apply_map`):
+changes the probability P of each pose sample (`slipid.robot.filter.pose_fix.apply_map`):
 
     P(x_s) ~ (sum_c p_c' W_sc / prior_c  /  sum_c p_c W_sc / prior_c)^(1/4)
 
-so that crossing an edge at an unexpected place corrects the pose. Evidence corrects the pose only
-in the step in which it is measured; without evidence the map does not change the pose.
+so that crossing an edge at an unexpected position corrects the pose. Evidence corrects the pose
+only in the step in which it is measured; without evidence the map does not change the pose.
 """
 
 from collections.abc import Sequence
@@ -70,13 +71,13 @@ class Floor(eqx.Module):
         cell: float,
         labels: Sequence[str],
     ) -> "Floor":
-        """Return the map for a robot's labels, from cells that contain indices into `surfaces`."""
+        """Return the map with surfaces numbered as in `labels`, from indices into `surfaces`."""
         numbers = [labels.index(name) if name in labels else -1 for name in surfaces]
         numbered = np.array(numbers)[np.asarray(cells)]
         return cls(jnp.asarray(numbered), jnp.asarray(corner), jnp.asarray(cell))
 
     def save(self, path: Path | str, labels: Sequence[str]) -> None:
-        """Write the map of a robot with these labels as a file that can be read with numpy alone.
+        """Write the map of a robot with the floors `labels` as a file that numpy can read.
 
         Raises:
             DataError: the file cannot be written.
@@ -86,14 +87,15 @@ class Floor(eqx.Module):
 
     @classmethod
     def load(cls, path: Path | str, labels: Sequence[str]) -> "Floor":
-        """Return the map in a file written by `save`, for a robot with these labels.
+        """Return the map in a file written by `save`, for a robot with the floors `labels`.
 
         Raises:
-            DataError: the file is absent or is not such a map.
+            DataError: the file is absent or was not written by `save`.
         """
         try:
             with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as file:
-                names = [*file["labels"].tolist(), ""]  # -1 means an unknown surface
+                # index -1, an unknown surface, picks the last name, "", which is no label
+                names = [*file["labels"].tolist(), ""]
                 corner, cell = tuple(file["corner"].tolist()), float(file["cell"])
                 return cls.of(names, file["cells"], corner, cell, labels)
         except (OSError, ValueError, LookupError, TypeError, EOFError, BadZipFile) as error:
@@ -102,13 +104,13 @@ class Floor(eqx.Module):
     def under(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
     ) -> Int[Array, " wheel"]:
-        """Return the number of the surface under each wheel of a robot at a pose.
+        """Return the index of the surface under each wheel of a robot at a pose.
 
-        Outside the map it is the surface of the nearest cell.
+        Outside the map the nearest cell determines the surface.
 
         Args:
             pose: x, y [m] and heading [rad].
-            wheels: places of the wheels in the body frame [m].
+            wheels: positions of the wheels in the body frame [m].
         """
         (row, column), (rows, columns) = self.steps_to(pose, wheels), self.cells.shape
         return self.cells[row.clip(0, rows - 1), column.clip(0, columns - 1)]
@@ -116,7 +118,7 @@ class Floor(eqx.Module):
     def steps_to(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
     ) -> tuple[Int[Array, " wheel"], Int[Array, " wheel"]]:
-        """Return row and column of each wheel; they may lie outside the map's cells."""
+        """Return the row and the column of the cell under each wheel, possibly off the map."""
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turned = jnp.stack(
             [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1
@@ -132,13 +134,13 @@ class Floor(eqx.Module):
         hypotheses: Int[np.ndarray, "hypothesis wheel"],
         floors: int,
     ) -> Float[Array, "sample hypothesis"]:
-        """Return W, the probability that the map gives each hypothesis at each pose sample.
+        """Return the probability W_sc that the map gives each hypothesis c at each pose sample s.
 
         Args:
-            pose: estimated pose.
-            root: lower triangular root of its covariance.
-            wheels: places of the wheels in the body frame [m].
-            hypotheses: floor under every wheel.
+            pose: estimated pose [m, m, rad].
+            root: lower triangular root of the pose's covariance.
+            wheels: positions of the wheels in the body frame [m].
+            hypotheses: index of the floor under every wheel in each hypothesis.
             floors: number of floors.
         """
         poses = pose + SPREAD @ root.T

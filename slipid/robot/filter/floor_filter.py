@@ -1,20 +1,21 @@
 """Filter over the floors under the wheels, with one hypothesis for all wheels together.
 
 All wheels move the same body, so every hypothesis assigns a floor to each wheel (`hypotheses`); one
-further hypothesis is "unknown":
+further hypothesis is "unknown". In every step, after wheels may have changed floors:
 
-    xi_c, I_c     contact equilibrium with the estimated effect of a single floor, and motor
-                  currents, of hypothesis c at the wheel speeds
-    p_c <- p_c * (p(I | I_c) p(gyro | xi_c))^(dt / tau)   after wheels may have changed floors
-    g_c <- g_c * exp(xi_c dt)                             pose if c is true, averaged over changes
-    g = sum_c p_c g_c
+    xi_c, I_c     body twist by contact equilibrium, and motor currents, of hypothesis c at the
+                  wheel speeds; xi_c includes the floor's mean effect if all wheels are on one floor
+    p_c <- p_c * (p(I | I_c) p(gyro | xi_c))^(dt / tau)   probability of c
+    g_c <- g_c * exp(xi_c dt)                             pose if c is true
+    g = sum_c p_c g_c                                     mean pose
 
-with p_c the probability of c, xi_c its body twist [m/s, m/s, rad/s], I the measured and I_c the
-predicted currents [A], and tau the time within which evidence repeats (`Settings.forget_s`) [s].
+where the units of xi_c are [m/s, m/s, rad/s], I are the measured and I_c the predicted currents
+[A], and tau is the time within which measurements count as one piece of evidence
+(`Settings.forget_s`) [s].
 
-A wheel's current shows its fraction of the total drag, not the drag beneath it; only all currents
-together distinguish the floors. Evidence that comes late corrects the pose by the distance between
-the hypotheses' poses (interacting multiple models; Blom and Bar-Shalom 1988).
+A wheel's current shows the wheel's fraction of the total drag, not the drag of the floor beneath
+it; only all currents together distinguish the floors. Evidence that comes late corrects the pose by
+the distance between the hypotheses' poses (interacting multiple models; Blom and Bar-Shalom 1988).
 """
 
 from dataclasses import replace
@@ -58,9 +59,9 @@ class FloorState(eqx.Module):
     """Belief over the hypotheses.
 
     Attributes:
-        belief: probability of each hypothesis, and of "unknown" in the last place.
-        expected: probability of each hypothesis at the robot's pose before any measurement, by the
-            map or else by the prior.
+        belief: probability of each hypothesis; the last element is that of "unknown".
+        expected: probability of each hypothesis without measurements: by the map at the robot's
+            pose, or by the prior without a map.
         twist: twist by contact equilibrium, without effects, if the hypothesis were true
             [m/s, m/s, rad/s].
         apart: pose if the hypothesis were true, relative to the estimated pose [m, m, rad].
@@ -80,14 +81,15 @@ class BodyMotion(eqx.Module):
         scatter: covariance of the twist over hypotheses.
         rolling: twist of the body if no wheel slipped [m/s, m/s, rad/s].
         rolled: direction and speed of `rolling`.
-        left: remaining std of every floor's effects in this direction [m/m, m/m, rad/m].
-        by_friction: derivative of the mean twist by the log friction of each floor [m/s, m/s,
-            rad/s].
+        left: remaining std of every floor's effects in the direction of `rolling`
+            [m/m, m/m, rad/m].
+        by_friction: derivative of the mean twist with respect to each floor's log friction
+            [m/s, m/s, rad/s].
         known: probability of every hypothesis after this step, given that one of them is true.
-        before: the same probability without the evidence of this step.
+        before: probability like `known`, but without the evidence of this step.
         under: probability of each floor under each wheel, given that one hypothesis is true.
-        jump: change of pose beyond the mean twist, from late evidence [m, m, rad].
-        correction: change of the mean twist by the evidence of this step [m/s, m/s, rad/s].
+        jump: change of the pose beyond the mean twist, caused by late evidence [m, m, rad].
+        correction: change of the mean twist caused by this step's evidence [m/s, m/s, rad/s].
     """
 
     twist: Float[Array, "3"]
@@ -122,8 +124,8 @@ class FloorFilter(eqx.Module):
     def prior(self) -> Float[Array, " hypothesis"]:
         """Return the probability of every hypothesis before any measurement.
 
-        All hypothetical floors (`slipid.robot.unseen`) together have the prior probability of one
-        further floor under the robot.
+        Each further floor under the robot reduces the probability by `further_floor_penalty`. All
+        hypothetical floors (`slipid.robot.unseen`) together count as one further floor.
         """
         under = hypotheses_of(self.robot).under
         kinds = np.array([len(set(row)) for row in under.tolist()])
@@ -149,20 +151,21 @@ class FloorFilter(eqx.Module):
             old: belief before the step.
             w: wheel speed of every drive [rad/s].
             currents: motor currents.
-            turn: yaw rate by the gyro without its bias, NaN without a gyro [rad/s].
+            turn: gyro's yaw rate less its bias; NaN without a gyro [rad/s].
             tick: the time step.
-            mapped: probability of every hypothesis by a floor map at the robot's pose.
+            mapped: probability that a floor map gives every hypothesis at the robot's pose; None
+                without a map.
         """
         settled, predicted = self.solve(old.twist, w)
         f, hypotheses = self.robot, hypotheses_of(self.robot)
         rolling = f.inverse @ (f.frame.radius * w)
         rolled = RolledMotion.of(rolling, f.frame.base)
         mean, part = f.effect_table.at(rolled)
-        # the estimates hold for all wheels on one floor
+        # add mean effects only to hypotheses with all wheels on one floor: only these were fitted
         effect = rolled.speed * mean @ rolled.axes.T
         xi = settled + jnp.zeros((len(hypotheses), 3)).at[hypotheses.uniform].set(effect)
         known_log, unknown_log = self._evidence(xi, predicted, currents, w, turn)
-        # Evidence has less weight while wheels accelerate, since the equilibrium neglects inertia.
+        # give evidence less weight while wheels accelerate, since the equilibrium neglects inertia
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
         weight = weight / (1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2)
         prior, apart = self._after_floor_changes(old, xi, tick, mapped)
@@ -193,8 +196,8 @@ class FloorFilter(eqx.Module):
     def _remaining_std(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Return the remaining std of every floor's effects as a fraction of the whole std [1].
 
-        With wheels on several floors the whole std remains, since the estimates are for all wheels
-        on one floor.
+        The whole std is the std without an effect table. While wheels are on several floors it
+        remains, since the table's estimates are for all wheels on one floor.
         """
         alone = known[hypotheses_of(self.robot).uniform]
         share = alone / jnp.maximum(self.robot.rest @ under, 1e-12)
@@ -205,7 +208,7 @@ class FloorFilter(eqx.Module):
     ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis drive"]]:
         """Return twist [m/s, m/s, rad/s] and currents [A] of every hypothesis.
 
-        The iteration starts from `near`, the twists of the last step.
+        `w` are the wheel speeds [rad/s]; the iteration starts from `near`, the last step's twists.
         """
         f = self.robot
         on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
@@ -220,10 +223,10 @@ class FloorFilter(eqx.Module):
         return twist.T, amps + jnp.sign(amps) * more
 
     def _by_friction(self, twist: Array, w: Array, under: Array) -> Float[Array, "3 floor"]:
-        """Return the derivative of a twist by the log friction of each floor under the wheels.
+        """Return the derivative of a twist with respect to each floor's log friction.
 
-        It follows from the balance of forces. Its magnitude is limited to the body's speed, since
-        linearization fails if all wheels slide.
+        The derivative follows from the balance of forces. Its magnitude is limited to the body's
+        speed, since linearization fails if all wheels slide.
         """
         f = self.robot
         rim = f.frame.radius * f.at_wheels(w)
@@ -234,7 +237,9 @@ class FloorFilter(eqx.Module):
         def force(mu: Array) -> Planar:
             return Balance(rim, replace(on, floor=replace(on.floor, friction=mu))).force(xi)
 
-        def pushed(part: Array) -> Planar:  # Friction coefficients are divided by their mean.
+        def pushed(part: Array) -> Planar:
+            # a wheel's force depends on its friction divided by the mean friction, so the change of
+            # the mean is subtracted
             return jax.jvp(force, (mu,), (part - mu * jnp.mean(part),))[1]
 
         slope = solve3(Balance(rim, on).at(xi).jacobian(), jax.vmap(pushed)(each.T))
@@ -245,10 +250,10 @@ class FloorFilter(eqx.Module):
     def _evidence(
         self, xi: Array, predicted: Array, currents: MotorCurrents, w: Array, turn: Array
     ) -> tuple[Array, Array]:
-        """Return the log likelihoods of the measurements under every hypothesis and "unknown".
+        """Return the log likelihoods of the measurements under every hypothesis, and "unknown".
 
-        Variances are divided by their mean over hypotheses: that adds the same constant to the log
-        likelihood of every hypothesis and keeps the product within the range of single precision.
+        Variances are divided by their mean over hypotheses. This adds the same constant to the log
+        likelihoods of all hypotheses and keeps the product within the range of single precision.
         """
         f, s = self.robot, self.settings
         amps, measured = currents.filtered, currents.measured
@@ -263,15 +268,15 @@ class FloorFilter(eqx.Module):
         counts = jnp.append(measured > 0, jnp.isfinite(turn))
         worst = (s.unknown_std + 1.0) ** 2
         score = jnp.sum(jnp.where(counts, jnp.minimum(gap**2 / var, worst), 0.0), axis=1)
-        # One logarithm of a product is cheaper than several logarithms.
+        # take one logarithm of the product, which is cheaper than the sum of several logarithms
         spread = jnp.prod(jnp.where(counts, var / jnp.mean(var, axis=0), 1.0), axis=1)
         return -0.5 * (score + jnp.log(spread)), -0.5 * s.unknown_std**2 * jnp.sum(counts)
 
     def _of_friction(self, amps: Float[Array, "hypothesis drive"]) -> Array:
         """Return the variance of currents due to uncertain friction of several floors [A^2].
 
-        A wheel bears a fraction of the total drag in proportion to its floor's friction divided by
-        the mean friction.
+        A wheel's fraction of the total drag is proportional to its floor's friction divided by the
+        mean friction, so with all wheels on one floor the variance is 0.
         """
         on = hypotheses_of(self.robot).on.astype(float)
         over = (on - on.mean(axis=1, keepdims=True)).reshape(-1, on.shape[2])
@@ -279,9 +284,10 @@ class FloorFilter(eqx.Module):
         return amps**2 * self.robot.on_average(var.reshape(on.shape[:2]))
 
     def _stiction(self, w: Array) -> Array:
-        """Return the variance of the current of a wheel at rest [A^2]; it is 0 for a turning one.
+        """Return the variance of currents due to static friction [A^2]; 0 for turning wheels.
 
-        Static friction lets the current lie anywhere between two bounds; it is assumed uniform.
+        At a wheel at rest, static friction lets the current lie anywhere between two bounds; the
+        current is assumed to be uniformly distributed.
         """
         motor = self.robot.motor
         return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
@@ -301,8 +307,8 @@ class FloorFilter(eqx.Module):
             fresh, whole = mapped, _followed(whole, old.expected, mapped, change)
         stayed = whole[:, 0] * (1 - 0.05 * change)
         of_known = stayed + 0.2 * change * unknown * fresh
-        # The probability that returns from "unknown" gets the mean pose, which has the relative
-        # pose 0.
+        # belief that returns from "unknown" has relative pose 0 (the mean pose), so it adds only to
+        # the divisor
         apart = whole[:, 1:] * ((1 - 0.05 * change) / of_known)[:, None]
         of_none = unknown * (1 - 0.2 * change) + 0.05 * change * sure
         return jnp.append(of_known, of_none), apart
@@ -310,8 +316,8 @@ class FloorFilter(eqx.Module):
     def _changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
         """Return the belief after each wheel in turn may have changed its floor.
 
-        The new floor has its prior probability, given the floors under the other wheels. Columns of
-        `p` are the probability, and its products with the relative pose.
+        The new floor is drawn by the prior, given the floors under the other wheels. Columns of `p`
+        are the probability and its products with the relative pose.
         """
         prior, none = self.prior(), jnp.zeros((1, p.shape[1]))
         for beside in hypotheses_of(self.robot).beside:
@@ -323,7 +329,7 @@ class FloorFilter(eqx.Module):
     def _unseen_changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
         """Return the belief after the whole robot may have moved to or from a hypothetical floor.
 
-        Such a change is as improbable as one to the "unknown" floor.
+        Such a change is as improbable as a change to the "unknown" floor.
         """
         unseen = np.array(self.robot.unseen)
         if not unseen.any():
@@ -341,9 +347,9 @@ class FloorFilter(eqx.Module):
     ) -> tuple[Array, Array]:
         """Return poses of the hypotheses relative to their mean, and the jump of the mean pose.
 
-        The jump is the change of the mean pose beyond the mean twist; late evidence on the floors
-        causes it. Each hypothesis continues from its pose with its twist; the yaw rate of a gyro,
-        if there is one, replaces that of all twists.
+        Each hypothesis moves on from its own pose with its own twist, whose yaw rate is replaced by
+        the gyro's if there is a gyro. The jump is the change of the mean pose beyond the mean
+        twist, which late evidence on the floors causes.
         """
         xi = xi.at[:, 2].set(jnp.where(jnp.isfinite(turn), turn, xi[:, 2]))
         poses = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, tick.dt))
@@ -359,9 +365,10 @@ def _followed(
 ) -> Float[Array, "hypothesis column"]:
     """Return the belief after a step of a robot whose map predicts the floors at its new pose.
 
-    Hypotheses whose probability by the map fell lose the same fraction of their belief to those
-    whose probability rose. In addition, a fraction `change` of the belief returns to the map's
-    probabilities, in case the map is wrong.
+    If the probability that the map gives a hypothesis fell (from `before` to `now`), the hypothesis
+    loses the same fraction of its belief to the hypotheses whose probability rose. In addition, a
+    fraction `change` of the belief returns to the map's probabilities, so that evidence against the
+    map is forgotten as the robot drives on.
     """
     gone = jnp.clip(1 - now / jnp.maximum(before, 1e-12), 0.0, 1.0)[:, None]
     more = jnp.maximum(now - before, 0.0)
@@ -371,5 +378,5 @@ def _followed(
 
 
 def length(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:
-    """Return the length of a vector; unlike the norm it has a derivative at zero."""
+    """Return the length of a vector, with 1e-24 added under the root for a derivative at zero."""
     return jnp.sqrt(jnp.sum(v * v, axis=-1) + 1e-24)

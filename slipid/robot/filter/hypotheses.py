@@ -1,11 +1,12 @@
 """Hypotheses about the floors under all wheels of a robot.
 
-The number of assignments, floors to the power of wheels, grows fast: 625 for four wheels on five
+The number of assignments of floors to wheels grows as floors^wheels: 625 for four wheels on five
 floors. The edge of a floor is nearly straight on the scale of a robot, so going around the robot
-from wheel to wheel the floor changes at most twice: every hypothesis has one floor, or two with
-neighbouring wheels on each side. That leaves 125 of the 625, and 21 of the 27 for three wheels.
-Three floors at once, where patches meet at a corner, are represented by the most similar of these
-or by "unknown". A hypothetical floor (`slipid.robot.unseen`) is under all wheels or under none.
+from wheel to wheel the floor changes at most twice: every hypothesis has one floor, or two floors
+with neighbouring wheels on each. That leaves 125 of the 625, and 21 of the 27 for three wheels on
+three floors. Three floors at once, where patches meet at a corner, are represented by the most
+similar hypothesis or by "unknown". A hypothetical floor (`slipid.robot.unseen`) is under all wheels
+or under none.
 """
 
 import itertools
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Int
 from slipid.robot.deployed import RobotArrays
 
 MOST_CHANGES = 2
-"""Largest number of pairs of neighbouring wheels around the robot that stand on two floors."""
+"""Largest number of floor changes from wheel to wheel when going around the robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +27,11 @@ class Hypotheses:
     """All hypotheses of the floors under a robot.
 
     Attributes:
-        under: number of the floor under each wheel.
-        beside: for each wheel, hypothesis and floor, index of the hypothesis with this floor under
-            this wheel and the other wheels unchanged; if there is none, the number of hypotheses.
-        uniform: for each floor, the hypothesis that has it under all wheels.
-        on: True if the floor is under the wheel.
+        under: index of the floor under each wheel.
+        beside: for each wheel, hypothesis and floor, index of the hypothesis that differs only by
+            having this floor under this wheel; the number of hypotheses if there is no such one.
+        uniform: for each floor, index of the hypothesis with this floor under all wheels.
+        on: True if the hypothesis has the floor under the wheel.
     """
 
     under: Int[np.ndarray, "hypothesis wheel"]
@@ -43,7 +44,7 @@ class Hypotheses:
 
 
 def hypotheses_of(robot: RobotArrays) -> Hypotheses:
-    """Return the hypotheses of a robot on its identified floors."""
+    """Return the hypotheses of a robot on its identified and hypothetical floors."""
     return _hypotheses(robot.around, robot.unseen, MOST_CHANGES)
 
 
@@ -73,5 +74,5 @@ def _hypotheses(around: tuple[int, ...], unseen: tuple[bool, ...], changes: int)
 
 
 def _changes(row: tuple[int, ...], around: tuple[int, ...]) -> int:
-    """Return the number of neighbouring wheels around the robot that stand on different floors."""
+    """Return the number of floor changes from wheel to wheel when going around the robot."""
     return sum(row[a] != row[b] for a, b in zip(around, around[1:] + around[:1], strict=True))

@@ -1,15 +1,17 @@
 """Filter of the pose and its covariance, with the errors of the model as further states.
 
 Process noise and effects increase the covariance. The effects, the friction of the floors and the
-bias of a gyro are unknowns that are corrected by pose fixes and during rests. Friction affects the
-motion only if wheels stand on several floors, so runs on one floor each do not determine it.
-Uncertainty about the floors is the scatter S of the hypotheses' twists xi_c about their mean xi,
-with probabilities p_c. An error d of the belief persists for a while:
+bias of a gyro are further states, which pose fixes correct; the bias is also corrected at rest.
+Friction affects the motion only if wheels stand on several floors, so fitted runs that stay on one
+floor each leave it uncertain. Uncertainty about the floors is the scatter S of the hypotheses'
+twists xi_c about their mean xi, with probabilities p_c. An error d of the belief persists for a
+while:
 
     S = sum_c p_c (xi_c - xi) (xi_c - xi)^T = L L^T,   xi_true = xi + L d,   d ~ N(0, 1)
     d <- k d + sqrt(1 - k^2) noise,   k = exp(-far / doubt_m)
 
-with `far` the path length of the step [m] and `doubt_m` its decay length, a setting [m].
+where `far` is the path length of the step [m] and `doubt_m` the path length over which d decays
+[m], see `Settings`.
 """
 
 from dataclasses import replace
@@ -36,19 +38,19 @@ from slipid.robot.filter.pose_fix import (
 from slipid.robot.interface import Readings, Settings
 
 CREEP_SPEED = 0.05
-"""Below this speed the gyro does not correct the contact model, since fitted runs are faster
-[m/s]."""
+"""Speed below which a gyro's difference from the contact model is not used, since fitted runs are
+faster and the model is not known there [m/s]."""
 
 
 class _StepMotion(eqx.Module):
     """Motion of the body in a step with its derivatives.
 
     Attributes:
-        speed: `RolledMotion.speed`; effects are relative to it [m/s].
-        axes: directions along, across and in yaw, as columns in the body frame.
-        slope: derivative of the twist by the nuisance states without the gyro's bias.
+        speed: `RolledMotion.speed`, the speed that effects are relative to [m/s].
+        axes: unit vectors along, across and in yaw, as columns in the body frame.
+        slope: derivative of the twist with respect to the nuisance states, except the gyro's bias.
         share: expected fraction of the weight on each floor [1].
-        by_gyro: whether a gyro measures the yaw rate.
+        by_gyro: True if a gyro measures the yaw rate.
     """
 
     speed: Float[Array, ""]
@@ -98,25 +100,24 @@ class PoseFilter(eqx.Module):
     def step(
         self, old: PoseState, motion: BodyMotion, gyro: Array, z: Readings, tick: TimeStep
     ) -> tuple[PoseState, Float[Array, "3"], Float[Array, "3 3"]]:
-        """Return the state one time step later, the twist of the step, and a factor on distances.
+        """Return the state one time step later, the twist of the step, and a matrix (3, 3).
 
-        A pose fix also corrects the poses of the hypotheses: their distances from the estimated
-        pose are to be multiplied by the factor (3, 3), in body axes. It is the identity without a
-        fix.
+        A pose fix also corrects the poses of the hypotheses: the caller must multiply their
+        distances from the estimated pose, in body axes, by the matrix. Without a fix the matrix is
+        the identity.
 
         Args:
             old: state before the step.
-            motion: motion by the floor filter.
-            gyro: yaw rate, NaN without a gyro [rad/s].
-            z: readings, for their pose fix.
+            motion: motion that the floor filter returned.
+            gyro: gyro's yaw rate; NaN without a gyro [rad/s].
+            z: readings, of which only the pose fix is used.
             tick: the time step.
         """
         dt = tick.dt
         body = self._step_motion(motion, gyro)
         old = self._forgotten(old, motion, tick)
-        free = (
-            motion.twist + body.slope @ old.nuisance[:-1]
-        )  # at any speed, since even a slow motion adds up
+        # correct the twist by the nuisance states at any speed, since even slow motion adds up
+        free = motion.twist + body.slope @ old.nuisance[:-1]
         old = replace(old, history=old.history.at[:, 0].add(dt))
         twist = free.at[2].set(self._turned(old, free[2], gyro))
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
@@ -136,7 +137,8 @@ class PoseFilter(eqx.Module):
         speed, axes = motion.rolled.speed, motion.rolled.axes
         std = speed * share[:, None] * motion.left
         by_effect = (std[:, :, None] * axes.T).reshape(-1, 3).T
-        # The covariance is per metre, so that it does not grow while the robot is at rest.
+        # take the root of the scatter per metre and multiply it by the speed afterwards, so that
+        # the small variance that `cholesky_root` adds vanishes while the robot is at rest
         per_metre = motion.scatter / jnp.maximum(speed**2, 1e-12)
         doubt = speed * axes @ cholesky_root(axes.T @ per_metre @ axes)
         return _StepMotion(
@@ -150,7 +152,8 @@ class PoseFilter(eqx.Module):
     def _forgotten(self, old: PoseState, motion: BodyMotion, tick: TimeStep) -> PoseState:
         """Return the state with effects and belief errors decorrelated over the step.
 
-        Their variances return towards their stationary values, which are 1.
+        The estimates of these states decay towards 0, and their variances return towards 1, their
+        stationary value.
         """
         f = self.robot
         speed = length(motion.twist[:2]) + f.frame.base * jnp.abs(motion.twist[2])
@@ -170,17 +173,21 @@ class PoseFilter(eqx.Module):
         """Return the present yaw rate: the gyro's reading less its bias, extrapolated [rad/s].
 
         A gyro's reading is delayed, so the contact model's change of yaw rate over that delay is
-        added. `free` is the contact model's yaw rate [rad/s], which is returned without a gyro;
-        ages in the history are those after the step.
+        added. Without a gyro, the contact model's yaw rate `free` [rad/s] is returned. The ages in
+        the history of `old` must already include the present step.
         """
         then = self._yaw_rate_then(old, free)
         return jnp.where(jnp.isfinite(gyro), free + gyro - old.nuisance[-1] - then, free)
 
     def _yaw_rate_then(self, now: PoseState, free: Array) -> Array:
-        """Return the yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
+        """Return the contact model's yaw rate when the gyro's reading was taken [rad/s].
+
+        `free` is the model's present yaw rate.
+        """
         delay = self.settings.gyro_delay_s
         if not isinstance(delay, jax.core.Tracer) and float(delay) == 0.0:
-            return free  # no delay: avoid the search, also in exported code
+            # a delay known to be 0 needs no search through the history, also in exported code
+            return free
         return jnp.where(delay == 0.0, free, nearest(now.history, delay)[4])
 
     def _gyro_update(
@@ -188,12 +195,11 @@ class PoseFilter(eqx.Module):
     ) -> PoseState:
         """Return the state corrected by comparing a moving robot's gyro with the contact model.
 
-        The gyro's reading is the model's yaw rate plus the model's errors and the gyro's own bias,
-        so that it informs about both, and about sideways errors that are correlated with them:
+        The gyro's reading is the model's yaw rate plus the model's errors and the gyro's bias:
 
             gyro = (twist + slope nuisance)_yaw + bias + noise
 
-        The noise is that of the gyro, plus the model's process noise, whose std grows with the root
+        The noise is the gyro's noise plus the model's process noise, whose std grows with the root
         of the path length. A reading far from the expected value has less weight, and so has every
         reading while wheels accelerate, since the equilibrium neglects inertia. Only heading and
         bias are updated; the errors of the model contribute to the variance but keep their values
@@ -216,8 +222,8 @@ class PoseFilter(eqx.Module):
     def _bias_at_rest(self, now: PoseState, gyro: Array) -> PoseState:
         """Return the state with the gyro's bias updated while the robot rests.
 
-        A reading that differs much from the known bias does not change the bias: the robot probably
-        creeps on an edge or is turned by hand.
+        The bias is not updated if the reading differs from it by more than 3 stds: the robot then
+        probably creeps on an edge or is turned by hand.
         """
         cov = now.covariance
         gap = gyro - now.nuisance[-1]
@@ -231,7 +237,7 @@ class PoseFilter(eqx.Module):
         f, s, dt = self.robot, self.settings, tick.dt
         world = axes_rotation(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
-        # With a gyro, effects and process noise of the floor do not affect the yaw.
+        # a gyro's yaw rate replaces the model's, so the model's errors then do not affect the yaw
         keep = jnp.where(body.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
         far = body.speed * dt
         push = world @ (keep[:, None] * body.slope)
@@ -242,7 +248,7 @@ class PoseFilter(eqx.Module):
         floor_axes = world @ (keep[:, None] * body.axes)
         noise = (floor_axes * grown) @ floor_axes.T
         noise = noise.at[2, 2].add(jnp.where(body.by_gyro, (s.gyro_std * dt) ** 2, 0.0))
-        rows = by @ old.covariance  # only the rows of the pose; the others do not change
+        rows = by @ old.covariance  # compute only the pose's rows; the nuisance's do not change
         pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
         rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
         return replace(
@@ -260,15 +266,15 @@ def _scalar_update(
 ) -> PoseState:
     """Return the state corrected by one scalar reading.
 
-    Unknowns that are not updated keep their values; Joseph's form of the update keeps the
-    covariance consistent with that.
+    Only the states selected by `learns` are updated; Joseph's form of the update gives the right
+    covariance also for the gain of 0 of all other states.
 
     Args:
         now: state before the reading.
-        look: derivative of the reading by pose and nuisance.
+        look: derivative of the reading with respect to pose and nuisance.
         gap: measured less predicted reading [unit of the reading].
         var: variance of the gap [unit of the reading, squared].
-        learns: 1 for each unknown that is updated, else 0.
+        learns: 1 for each element of pose and nuisance that is updated, else 0.
     """
     by = now.covariance @ look
     gain = learns * by / var
@@ -289,9 +295,10 @@ def axes_rotation(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
 
 
 def cholesky_root(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the lower triangular root of a covariance of poses, or of motions per metre.
+    """Return the lower triangular Cholesky root of a covariance of poses, or of motions per metre.
 
-    A std of 0.1 mm and 0.1 mrad (or the same per metre) is added first, so that the root exists.
+    A std of 0.1 mm and 0.1 mrad (or 0.1 mm/m and 0.1 mrad/m) is added, so that the root also
+    exists for a singular covariance.
     """
     a = jnp.sqrt(m[0, 0] + 1e-8)
     b, d = m[1, 0] / a, m[2, 0] / a

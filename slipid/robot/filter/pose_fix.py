@@ -12,10 +12,11 @@ from slipid.robot.filter.floor_filter import BodyMotion
 from slipid.robot.interface import Readings
 
 HISTORY_STEPS = 48
-"""Number of past steps that are kept, which limits the age of a delayed measurement."""
+"""Number of entries in the history, the last step included; it limits the age of a delayed
+measurement."""
 MAP_EXPONENT = 0.25
-"""Exponent on the floors' likelihood of a pose [1]. It is below 1 because an error of the map
-affects many steps, so that their evidence is not independent."""
+"""Exponent on the likelihood that the belief about floors gives a pose [1]. It is below 1 because
+an error of the map affects many steps, so that the evidence of these steps is not independent."""
 
 
 class PoseState(eqx.Module):
@@ -23,19 +24,19 @@ class PoseState(eqx.Module):
 
     Attributes:
         pose: x, y [m], heading [rad].
-        nuisance: effects of every floor along, across and in yaw beyond their estimates, in
-            remaining stds, errors of their log frictions, belief errors d [1], then the gyro's bias
-            [rad/s].
+        nuisance: effects of every floor along, across and in yaw, less their means and in units of
+            their remaining stds; errors of the floors' log frictions; three belief errors d [1];
+            the gyro's bias [rad/s].
         covariance: covariance of pose and nuisance [products of their units].
         toward: settled direction of travel, see `slipid.robot.filter.effects`.
         still: time since the robot last moved [s].
-        noise: covariance that process noise added to the pose over the history, in products of
-            [m, m, rad].
-        far: path length over the history [m].
-        push: derivative of the pose by the nuisance per metre of the last motion, without the
-            gyro's bias [m/m, m/m, rad/m].
+        noise: covariance that process noise has added to the pose since the oldest entry of the
+            history, in products of [m, m, rad].
+        far: path length since the oldest entry of the history [m].
+        push: derivative of the pose with respect to the nuisance, except the gyro's bias, per metre
+            of the last motion [m/m, m/m, rad/m].
         history: last steps, the newest first. Columns: age [s], pose [m, m, rad], yaw rate of the
-            contact model [rad/s], `noise` in row-major order and `far` [m] after that step.
+            contact model [rad/s], `noise` in row-major order and `far` [m] after the step.
     """
 
     pose: Float[Array, "3"]
@@ -50,10 +51,10 @@ class PoseState(eqx.Module):
 
 
 def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
-    """Return the state corrected by a pose fix, if there is one, and the factor on distances.
+    """Return the state corrected by a pose fix, if there is one, and a matrix (3, 3).
 
-    The distance of each hypothesis's pose from the estimated pose is to be multiplied by the factor
-    (3, 3), in world axes; it is the identity without a fix.
+    The caller must multiply the distance of each hypothesis's pose from the estimated pose, in
+    world axes, by the matrix. Without a fix the matrix is the identity.
     """
     age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
     has = (
@@ -75,13 +76,14 @@ def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3
 def _corrected(
     now: PoseState, fix: Array, std: Array, age: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return pose, nuisance, covariance, history and the factor on distances after a pose fix.
+    """Return pose, nuisance, covariance, history and the matrix of `apply_fix` after a pose fix.
 
-    The fix is of the pose `age` [s] ago. From then on, nuisance states are assumed to act on the
-    pose as they did in the last motion. The fix contains no information about process noise added
-    since then, so the covariance of that noise is subtracted from that of the pose before the
-    update and added again after it. The part that the covariance of the pose no longer contains,
-    because a later fix removed it, is treated as noise of this fix.
+    The fix measures the pose at the time `age` [s] ago. Between that time and now, nuisance states
+    are assumed to act on the pose as they did in the last motion. The fix contains no information
+    about process noise that was added after that time, so the covariance of this noise is
+    subtracted from the covariance of the pose before the update and added again after it. A part of
+    it may no longer be in the covariance of the pose, because a later fix removed it; this part is
+    treated as noise of the present fix.
     """
     pose, cov, history = now.pose, now.covariance, now.history
     then = nearest(history, age)
@@ -98,7 +100,7 @@ def _corrected(
     noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
     rows = look @ cov
     total = rows @ look.T + noise
-    # A fix more than 3 stds from the expected pose has less weight, but is not rejected.
+    # enlarge the noise of a fix more than 3 stds from the expected pose, instead of rejecting it
     far = gap @ _inverse(total) @ gap
     total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
     gain = rows.T @ _inverse(total)
@@ -116,16 +118,18 @@ def apply_map(
     supports: Float[Array, "sample hypothesis"],
     motion: BodyMotion,
 ) -> tuple[PoseState, Float[Array, "3 3"]]:
-    """Return the state after comparing the belief about floors with a map, and a factor.
+    """Return the state after comparing the belief about floors with a map, and a matrix (3, 3).
 
-    The distance of each hypothesis's pose from the estimated pose is to be multiplied by the factor
-    (3, 3), in world axes.
+    The caller must multiply the distance of each hypothesis's pose from the estimated pose, in
+    world axes, by the matrix.
 
     Args:
         now: pose and covariance.
         root: root of the pose's covariance, with which the pose samples were drawn.
-        supports: probability of every hypothesis at every pose sample, see `Floor.supports`.
-        motion: belief over the hypotheses before this step's evidence and after it.
+        supports: probability that the map gives every hypothesis at every pose sample, see
+            `Floor.supports`.
+        motion: motion of the step; its `before` and `known` are the probabilities of the hypotheses
+            before and after this step's evidence.
     """
     share = supports / jnp.maximum(jnp.mean(supports, axis=0), 1e-12)
     weight = (share @ motion.known) / jnp.maximum(share @ motion.before, 1e-12)
@@ -151,16 +155,17 @@ def apply_map(
 def history_after_jump(
     old: PoseState, motion: BodyMotion, base: Float[Array, ""]
 ) -> Float[Array, "entry 15"]:
-    """Return the history after late evidence on the floors moved the pose.
+    """Return the history after late evidence on the floors moved the pose by a jump J.
 
-    The old and the new belief predict twists that differ; their poses are assumed to have diverged
-    at the present rate until now. So a path length s [m] ago, the fraction
+    The beliefs before and after the evidence predict different twists. The poses by the two beliefs
+    are assumed to have diverged at the present rate j per metre until now, when they differ by J.
+    So a path length s [m] ago, the fraction
 
-        1 - s (j . J) / |J|^2,   j the divergence per metre
+        1 - s (j . J) / |J|^2
 
-    of the jump J between them (limited to 0 ... 1, with yaw multiplied by the base radius) already
-    existed a path length s [m] ago. Past poses are shifted by that fraction of the jump. Otherwise
-    a fix of an earlier time would move the pose by the jump once more.
+    of J (limited to 0 ... 1, with yaw multiplied by the base radius) already existed, and a past
+    pose is shifted by this fraction of J. Without the shift, a fix of an earlier pose would move
+    the pose by the jump once more.
     """
     scale = jnp.stack([jnp.ones(()), jnp.ones(()), base])
     jump, apart = scale * motion.jump, scale * motion.correction
@@ -178,7 +183,7 @@ def shifted(
 ) -> Float[Array, "entry 15"]:
     """Return the history with past poses corrected by `change`, one row per entry.
 
-    The correction of heading rotates past positions about the present `pose`.
+    A correction of heading also rotates the past position about the present `pose`.
     """
     back = history[:, 1:3] - pose[:2]
     moved = change[:, :2] + change[:, 2:] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
@@ -186,10 +191,10 @@ def shifted(
 
 
 def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
-    """Return the covariance of the pose given all other unknowns.
+    """Return the conditional covariance of the pose, given all nuisance states.
 
-    No more than this can be subtracted from the covariance of the pose alone: the rest is
-    correlated with the other unknowns, and subtracting more would give an indefinite matrix.
+    No more than this can be subtracted from the pose's own covariance: its other part is correlated
+    with the nuisance states, and subtracting more would give an indefinite joint covariance.
     """
 
     def known(k: Int[Array, ""], c: Array) -> Array:
@@ -203,8 +208,8 @@ def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
 def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """Return the covariance `part`, scaled down if needed so that it does not exceed `whole`.
 
-    The bound on the largest eigenvalue of whole^-1 part is the eighth root of the trace of its
-    eighth power, which exceeds that eigenvalue by a factor of at most 1.15.
+    The scale is 1 / b, where b is a bound on the largest eigenvalue of whole^-1 part: the eighth
+    root of the trace of the matrix's eighth power, at most 1.15 times that eigenvalue.
     """
     m = _inverse(whole) @ part
     for _ in range(3):
@@ -216,8 +221,8 @@ def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Arra
 def rebased(now: PoseState) -> PoseState:
     """Return the state with noise and path length counted from the oldest entry of the history.
 
-    Both then stay small even on long drives, and so do ages (which are stored instead of times), so
-    that 32-bit numbers suffice.
+    Noise and path length then stay small even on long drives, as do the ages that the history
+    stores instead of times, so that 32-bit numbers suffice.
     """
     first = now.history[-1, 5:]
     history = now.history.at[:, 5:].add(-first)
@@ -232,6 +237,6 @@ def nearest(history: Array, age: Array | float) -> Array:
 
 
 def _inverse(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the inverse of a positive definite matrix by the adjugate."""
+    """Return the inverse of a positive definite matrix, computed by the adjugate."""
     rows = jnp.stack([jnp.cross(m[1], m[2]), jnp.cross(m[2], m[0]), jnp.cross(m[0], m[1])], axis=1)
     return rows / jnp.maximum(m[0] @ rows[:, 0], 1e-30)

@@ -14,8 +14,8 @@ class WheelState(eqx.Module):
     Attributes:
         speed: speed of the wheels of each drive [rad/s].
         age: age of the last reading of each drive [s].
-        angle: encoder angle up to which motion has been counted [rad]; NaN before the first
-            reading.
+        angle: encoder angle up to which `speed` has accounted for motion [rad]; NaN before the
+            first reading.
     """
 
     speed: Float[Array, " drive"]
@@ -24,7 +24,7 @@ class WheelState(eqx.Module):
 
     @classmethod
     def init(cls, robot: RobotArrays, settings: Settings) -> "WheelState":
-        """Return the state at rest, without any reading so far."""
+        """Return the state at rest before the first reading."""
         n = robot.drives
         return cls(
             speed=jnp.zeros(n),
@@ -39,7 +39,7 @@ class MotorCurrents(eqx.Module):
     Attributes:
         filtered: filtered current [A]; its magnitude if `measured` is 1.
         measured: 0 if nothing was measured, 1 if only the magnitude, 2 if also the sign.
-        variance: variance of the sensors [A^2].
+        variance: variance of the measured current due to noise of the sensors [A^2].
     """
 
     filtered: Float[Array, " drive"]
@@ -48,7 +48,7 @@ class MotorCurrents(eqx.Module):
 
 
 def time_step(dt: Float[Array, ""] | float, settings: Settings) -> Float[Array, ""]:
-    """Return a time step limited to `longest_s`, or 0 unless it is a positive number [s]."""
+    """Return a time step limited to `Settings.longest_s`; 0 if it is not a positive number [s]."""
     dt = jnp.asarray(dt, dtype=float)
     passed = jnp.isfinite(dt) & (dt > 0)
     return jnp.where(passed, jnp.clip(dt, 1e-4, settings.longest_s), 0.0)
@@ -57,10 +57,10 @@ def time_step(dt: Float[Array, ""] | float, settings: Settings) -> Float[Array, 
 def read_wheels(
     robot: RobotArrays, settings: Settings, old: WheelState, z: Readings, dt: Array
 ) -> WheelState:
-    """Return wheel speeds, angles up to which motion has been counted, and ages of the readings.
+    """Return the motion of the wheels one time step `dt` [s] later.
 
     A wheel without readings keeps its speed until it is stale, then it counts as at rest. When its
-    encoder returns, the next step includes the motion missed in between.
+    encoder returns, the next step includes the motion that was missed in between.
     """
     most = 4.0 * robot.highest[0]
     turned = (z.wheel_angle - old.angle) / jnp.maximum(dt, 1e-3)
@@ -68,10 +68,10 @@ def read_wheels(
     by_speed = jnp.isfinite(z.wheel_speed) & (jnp.abs(z.wheel_speed) < most)
     read = jnp.where(by_angle, turned, jnp.where(by_speed, z.wheel_speed, old.speed))
     known = jnp.isfinite(z.wheel_angle) & (jnp.abs(z.wheel_angle) < 1e7)
-    # without an earlier angle a wheel counts as at rest
+    # the first angle gives no speed yet: accept it as a reading of a wheel at rest
     first = known & ~jnp.isfinite(old.angle) & ~by_speed
     good = by_angle | by_speed | first
-    # Readings without a valid time step do not reset the age.
+    # readings without a valid time step give no speed, so they do not reset the age
     age = jnp.where(good & (dt > 0), 0.0, jnp.minimum(old.age + jnp.maximum(dt, UNTIMED_S), 1e3))
     speed = jnp.where(age > settings.stale_s, 0.0, read)
     counts = known & ((dt > 0) | ~jnp.isfinite(old.angle))
@@ -82,11 +82,11 @@ def read_wheels(
 def read_currents(
     robot: RobotArrays, settings: Settings, old: Array, z: Readings, w: Array, dt: Array
 ) -> MotorCurrents:
-    """Return currents from ammeters and, through the motor's equation, from voltmeters.
+    """Return currents from ammeters and, by the motor's voltage equation, from voltmeters.
 
     Args:
         robot: robot with the constants of its motor.
-        settings: noise of the sensors and time constant of the filter.
+        settings: settings with the noise of the sensors and the filter's time constant.
         old: filtered currents before the step [A].
         z: readings.
         w: wheel speeds [rad/s].
@@ -105,7 +105,7 @@ def read_currents(
     now = share * jnp.where(known, ammeter, 0.0) + (1 - share) * jnp.where(volts, by_volts, 0.0)
     read = known | volts
     a = 1 - jnp.exp(-dt / s.filter_s)
-    # The sign follows from a voltage; an unsigned ammeter alone shows only the magnitude.
+    # a voltage gives the sign; an unsigned ammeter without a voltage gives only the magnitude
     return MotorCurrents(
         filtered=jnp.where(read, old + a * (now - old), old),
         measured=jnp.where(read, jnp.where(volts | s.current_is_signed, 2, 1), 0),

@@ -22,7 +22,7 @@ from tests.helpers.shared import invoke
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("7by5", 0.04, 0.03, "4X4_50", False), "7by5; expected squares"),
+        (("7by5", 0.04, 0.03, "4X4_50", False), "7by5; expected the numbers of squares"),
         (("2x5", 0.04, 0.03, "4X4_50", False), "3x3 or more"),
         (("7x5", 0.03, 0.04, "4X4_50", False), "markers smaller than squares"),
         (("7x5", 40.0, 30.0, "4X4_50", False), "40 m .* in metres and of 1 m at most"),
@@ -41,8 +41,8 @@ def test_boards_that_cannot_be_are_refused(words, message):
     [
         ({"columns": 5, "rows": 7}, "--board 7x5 --dictionary 4X4_50 without --legacy"),
         ({"dictionary": "6X6_250"}, "--board 7x5 --dictionary 4X4_50"),
-        ({"columns": 9, "rows": 8}, "17 markers of 4X4_50 are there, numbers 0 to 16"),
-        ({"columns": 9, "rows": 8, "dictionary": "6X6_250"}, "say --dictionary 4X4_50"),
+        ({"columns": 9, "rows": 8}, "found 17 markers of 4X4_50 with numbers from 0 to 16"),
+        ({"columns": 9, "rows": 8, "dictionary": "6X6_250"}, "use --dictionary 4X4_50"),
     ],
     ids=["swapped", "dictionary", "size", "both"],
 )
@@ -118,7 +118,7 @@ def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
     assert done.exit_code == 1
     assert "POOR: 8 views; expected 10" in done.output
     assert np.abs(lens_from_file(out).lens.matrix[0, 0] - TRUE.fx) < 5
-    with pytest.raises(DataError, match="without a place above the floor"):
+    with pytest.raises(DataError, match="without a pose above the floor"):
         OverheadCamera.load(out)
 
 
@@ -127,8 +127,8 @@ def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
     [
         (("absent.png", *WORDS), "absent.png: No such file"),
         (("nothing.png", *WORDS), "nothing.png: the file is empty"),
-        (("words.png", *WORDS), "words.png: not a picture"),
-        (("absent*.png", *WORDS), "no file has such a name"),
+        (("words.png", *WORDS), "words.png: not an image"),
+        (("absent*.png", *WORDS), "no file matches this pattern"),
         (("floor.png", "small.png", *WORDS), "small.png: 320 x 240 pixels, but .*floor.png has"),
         (("floor.png", "empty.png", *WORDS), "1 usable views"),
         (("floor.png",), "--board is missing"),

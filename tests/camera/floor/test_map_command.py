@@ -25,21 +25,30 @@ POINT = '[[points]]\nsurface = "wood"\n'
 @pytest.mark.parametrize(
     ("config", "match"),
     [
-        ('[palette]\na = "#B08a5a"\nb = "#b08a5A"\n', "palette.b: '#b08a5A', the colour of a; exp"),
+        (
+            '[palette]\na = "#B08a5a"\nb = "#b08a5A"\n',
+            "palette.b: '#b08a5A' is also the colour of a; ",
+        ),
         ('[palette]\na = "brown"\n', "palette.a: 'brown'; expected"),
-        ('[palette]\na = "#ff00ff"\n', "palette.a: '#ff00ff' is nowhere in the picture"),
-        (POINT, r"points\[1\]: expected either at_px or at_m"),
-        (POINT + "at_px = [[1, 1]]\nat_m = [[0, 0]]\n", "either at_px or at_m"),
+        ('[palette]\na = "#ff00ff"\n', "palette.a: '#ff00ff' is nowhere in the image"),
+        (POINT, r"points\[1\]: both or neither of at_px and at_m are given"),
+        (POINT + "at_px = [[1, 1]]\nat_m = [[0, 0]]\n", "expected exactly one of them"),
         (POINT + "at_px = []\n", r"points\[1\].at_px: \[\]; expected"),
-        (POINT + "at_px = [[480, 10]]\n", r"\[480, 10\] is outside the picture of 480 x 400"),
+        (POINT + "at_px = [[480, 10]]\n", r"\[480, 10\] is outside the image of 480 x 400"),
         (POINT + "at_m = [[5.0, 0.0]]\n", r"points\[1\]: \[5, 0\] is not visible, outside the reg"),
         (POINT + "at_m = [[-0.75, 0.55]]\n", "on a mask or on a robot; expected a point on"),
         (POINT + "at_px = [[1, 399]]\n" + REGION, "not visible, outside the region"),
         ("[region]\nat_m = [[0, 0], [1, 1]]\n", "region: 2 corners; expected a polygon of 3"),
-        ("[region]\nat_m = [[9, 9], [9, 8], [8, 8]]\n", "region: no floor that the camera sees"),
+        ("[region]\nat_m = [[9, 9], [9, 8], [8, 8]]\n", "region: the camera sees no floor in it"),
         ("[region]\nat_px = [[9, 9], [9, 8], [8, 8]]\n", "expected 400 or more"),
-        ("[region]\nat_m = [[0, 0], [1, 1], [0.5, 0.5]]\n", r"region: \d+ cells of 8 mm that"),
-        ("[[mask]]\nat_m = [[-9, -9], [9, -9], [9, 9], [-9, 9]]\n", "hide all but 0 cells"),
+        (
+            "[region]\nat_m = [[0, 0], [1, 1], [0.5, 0.5]]\n",
+            r"camera sees \d+ cells of 8 mm; expected",
+        ),
+        (
+            "[[mask]]\nat_m = [[-9, -9], [9, -9], [9, 9], [-9, 9]]\n",
+            "leave 0 cells of visible floor",
+        ),
         ("[regions]\n", "regions: no such key, did you mean region"),
         ("[region\n", "not valid TOML"),
     ],
@@ -53,20 +62,22 @@ def test_errors_in_a_palette_are_reported(made, tmp_path, config, match):
 def test_a_surface_that_no_cell_has_is_refused(made):
     source = FloorPicture(IMAGE, made.picture, made.camera, Path("p.toml"), Palette(schema=SCHEMA))
     labels = np.array([[0, 2], [-1, 2]])
-    with pytest.raises(DataError, match=r"p\.toml: nothing in the picture looks most like b; exp"):
+    with pytest.raises(
+        DataError, match=r"p\.toml: no part of the image is closest in colour to b; "
+    ):
         check_all_present(source, ("a", "b", "c"), labels)
     check_all_present(source, ("a",), labels)
 
 
 def test_pictures_and_cameras_that_do_not_fit_are_refused(made, tmp_path):
     image = tmp_path / "floor.png"
-    with pytest.raises(DataError, match=r"floor\.png: No such file.*expected a picture"):
+    with pytest.raises(DataError, match=r"floor\.png: No such file.*expected an image"):
         map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     image.write_bytes(b"")
     with pytest.raises(DataError, match=r"floor\.png: the file is empty"):
         map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     image.write_bytes(b"no picture at all")
-    with pytest.raises(DataError, match="not a picture that OpenCV reads"):
+    with pytest.raises(DataError, match="not an image that OpenCV reads"):
         map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     with pytest.raises(DataError, match="480 x 400 pixels, but the camera was calibrated at 640"):
         mapped(MadeFloor(made.picture, aslant(640), made.truth, None), tmp_path, None)
@@ -76,9 +87,9 @@ def test_pictures_and_cameras_that_do_not_fit_are_refused(made, tmp_path):
         mapped(made, tmp_path, REGION, cell=0.0005)
     with pytest.raises(DataError, match="expected 400 or more: a smaller --cell"):
         mapped(made, tmp_path, REGION, cell=0.9)
-    with pytest.raises(DataError, match="it names 5 surfaces; expected no --surfaces with it"):
+    with pytest.raises(DataError, match="already has 5 surfaces; omit --surfaces"):
         mapped(made, tmp_path, REGION + marked(POINTS), surfaces=5)
-    with pytest.raises(DataError, match="too few for 30 surfaces; expected a picture of a floor"):
+    with pytest.raises(DataError, match="too few for 30 surfaces; expected an image of a floor"):
         mapped(made, tmp_path, REGION, surfaces=30)
 
 
@@ -124,7 +135,7 @@ def test_the_command_without_a_config_writes_one_and_keeps_an_edited_one(tmp_pat
     common = ("map", image, "--camera", tmp_path / "camera.json", "--out", out, "--quiet")
     code, text = invoked(*common)
     assert code == 0, text
-    assert "no marker of a robot was detected" in text
+    assert "no robot's marker was detected" in text
     assert f"--config {out / 'palette.toml'}" in text
     code, text = invoked(*common)
     assert code == 2

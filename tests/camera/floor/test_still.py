@@ -54,8 +54,8 @@ def test_a_picture_is_itself(tmp_path):
     [
         ("none.avi", None, "No such file"),
         ("empty.avi", b"", "the file is empty"),
-        ("words.avi", b"no video at all", "cannot open it"),
-        ("words.png", b"no picture", "not a picture that OpenCV reads"),
+        ("words.avi", b"no video at all", "cannot open this source"),
+        ("words.png", b"no picture", "not an image that OpenCV reads"),
     ],
 )
 def test_other_files_are_refused_by_their_name(tmp_path, name, data, message):

@@ -84,14 +84,14 @@ def test_rate_and_times_of_the_user_come_first(tmp_path):
     rows = [(k, 5 + 0.04 * k + 0.001 * (k % 3)) for k in range(COUNT)]
     timed = open_source(str(path), times=write_times(tmp_path / "t.csv", rows))
     np.testing.assert_allclose([f.time for f in timed.frames()], [t for _, t in rows])
-    with pytest.raises(DataError, match="--fps and --times at once"):
+    with pytest.raises(DataError, match="both --fps and --times are given"):
         open_source(str(path), fps=10.0, times=tmp_path / "t.csv")
 
 
 def test_times_too_few_or_too_many(tmp_path):
     path = write_video(tmp_path / "a.avi", pictures())
     few = write_times(tmp_path / "few.csv", [(k, 0.1 * k) for k in range(COUNT - 1)])
-    with pytest.raises(DataError, match="more than the 11 frames that have a time"):
+    with pytest.raises(DataError, match="more frames than the 11 given times"):
         list(open_source(str(path), times=few).frames())
     many = write_times(tmp_path / "many.csv", [(k, 0.1 * k) for k in range(COUNT + 1)])
     video = open_source(str(path), times=many)
@@ -107,7 +107,7 @@ def test_uneven_times_are_kept_and_reported(tmp_path, kind):
         assert np.all(np.diff(times) > 0)
         return
     np.testing.assert_allclose(times, np.array(ticks) / 1000, atol=1e-3)
-    assert "variable frame rate" in uneven(times)
+    assert "the frame rate varies" in uneven(times)
 
 
 def test_a_video_without_times_is_refused(tmp_path, monkeypatch):
@@ -124,14 +124,14 @@ def test_a_video_that_was_cut_off_gives_its_first_frames(tmp_path):
     video = open_source(str(tmp_path / "cut.avi"))
     frames = list(video.frames())
     assert 10 < len(frames) < 50
-    assert f"ends after frame {len(frames)} of 60" in cut_off(video, len(frames))
+    assert f"the frames end after {len(frames)} of 60" in cut_off(video, len(frames))
 
 
 def test_formats_that_estimate_their_length_are_not_cut_off():
     source = InMemory.even(pictures(100))
     assert cut_off(source, 100) is None
     assert cut_off(source, 97) is None
-    assert "ends after frame 96 of 100" in cut_off(source, 96)
+    assert "the frames end after 96 of 100" in cut_off(source, 96)
 
 
 @pytest.mark.parametrize("data", [b"", b"no video", b"RIFF" + bytes(200), bytes(5000)])
@@ -169,9 +169,9 @@ def test_a_folder_gives_pictures_by_name(tmp_path):
     assert numbers(folder) == list(range(COUNT))
     assert numbers(folder, 9) == [9, 10, 11]
     assert [frame.time for frame in folder.frames(2)][:2] == [0.1, 0.15]
-    with pytest.raises(DataError, match="pictures have no times; expected --fps or --times"):
+    with pytest.raises(DataError, match="images have no times; expected --fps or --times"):
         open_source(str(tmp_path))
-    with pytest.raises(DataError, match="12 pictures and 2 times"):
+    with pytest.raises(DataError, match="12 images and 2 times"):
         open_source(str(tmp_path), times=write_times(tmp_path / "t.csv", [(0, 0), (1, 1)]))
     alone = open_source(str(tmp_path / "f003.png"))
     assert numbers(alone) == [3]
@@ -184,7 +184,7 @@ def test_a_folder_gives_pictures_by_name(tmp_path):
 
 
 def test_a_folder_without_pictures(tmp_path):
-    with pytest.raises(DataError, match=r"no picture; expected \.png"):
+    with pytest.raises(DataError, match=r"no image; expected \.png"):
         open_source(str(tmp_path), fps=20.0)
 
 
@@ -192,13 +192,13 @@ def test_a_folder_without_pictures(tmp_path):
 
 
 def test_a_device_needs_an_end_and_has_its_own_times():
-    with pytest.raises(DataError, match="expected --seconds, the length"):
+    with pytest.raises(DataError, match="expected --seconds with the recording's duration"):
         open_source("0")
-    with pytest.raises(DataError, match="omit --fps and --times"):
+    with pytest.raises(DataError, match=r"--fps or --times is given, but .* omit both"):
         open_source("/dev/video7", fps=30.0, seconds=1.0)
     with pytest.raises(DataError, match="--seconds is for devices"):
         open_source("a.avi", seconds=1.0)
-    with pytest.raises(DataError, match=r"video97: OpenCV cannot open it; .* plugged in"):
+    with pytest.raises(DataError, match=r"video97: OpenCV cannot open this source; .* plugged in"):
         open_source("/dev/video97", seconds=1.0)
 
 
@@ -217,15 +217,15 @@ def test_a_device_gives_frames_with_times_from_zero_on(tmp_path):
 # times ------------------------------------------------------------------------------------------
 
 WRONG_TIMES = {
-    "": "other columns",
-    "time,frame\n0,0\n": "other columns",
+    "": "first columns other than frame and time",
+    "time,frame\n0,0\n": "first columns other than frame and time",
     "frame,time\n0,0\n2,1\n": "frame 2",
     "frame,time\n0,0\n1,0\n": "times that increase",
     "frame,time\n0,0\n1,nan\n": "times that increase",
     "frame,time\n0,inf\n": "times that increase",
-    "frame,time\n0,0\n1\n": "a frame and its time",
-    "frame,time\n0,zero\n": "a frame and its time",
-    "frame,time\n0,0\n\n": "a frame and its time",
+    "frame,time\n0,0\n1\n": "a frame number and its time",
+    "frame,time\n0,zero\n": "a frame number and its time",
+    "frame,time\n0,0\n\n": "a frame number and its time",
 }
 
 
@@ -243,7 +243,7 @@ def test_files_that_are_no_times(tmp_path):
     with pytest.raises(DataError, match="expected times of frames"):
         read_times(tmp_path)
     for fps in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(DataError, match="expected frames per second"):
+        with pytest.raises(DataError, match="expected a positive number of frames per second"):
             even_times(3, fps)
 
 

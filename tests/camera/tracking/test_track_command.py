@@ -143,7 +143,7 @@ def test_wrong_height_is_reported_and_ends_with_one(made, tmp_path):
     words = ("--marker-size", 0.131, "--marker-height", 0.0, "--quiet")
     done = track(made, made.video("robot", ROBOT), tmp_path / "p.csv", *words)
     assert done.exit_code == 1
-    assert "DOUBTFUL: robot: markers look +18" in done.stdout
+    assert "DOUBTFUL: robot: markers appear +18" in done.stdout
     assert (tmp_path / "p.csv").exists()
 
 
@@ -154,7 +154,7 @@ def test_a_video_that_was_cut_off_ends_with_one(made, tmp_path):
     assert done.exit_code == 1
     table = pd.read_csv(tmp_path / "p.csv")
     assert 5 < len(table) < 15
-    assert f"ends after frame {len(table)} of 20" in done.stdout
+    assert f"the frames end after {len(table)} of 20" in done.stdout
 
 
 def test_few_poses_end_with_one(made, tmp_path):
@@ -162,4 +162,4 @@ def test_few_poses_end_with_one(made, tmp_path):
     video = write_video(tmp_path / "a.avi", [*STAGE.film([ROBOT], 8), *empty])
     done = track(made, video, tmp_path / "p.csv", *LONE)
     assert done.exit_code == 1
-    assert "DOUBTFUL: robot: 8 of 38 frames have a pose" in done.stdout
+    assert "DOUBTFUL: robot: only 8 of 38 frames have a pose" in done.stdout

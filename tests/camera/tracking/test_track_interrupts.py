@@ -146,7 +146,7 @@ def test_killed_in_the_middle_it_goes_on(made, tmp_path):
     assert not (tmp_path / "p.csv").exists()
     done = track(made, video, tmp_path / "p.csv", *LONE[:-1])
     assert done.exit_code == 0
-    assert "going on from frame" in done.stderr
+    assert "resuming at frame" in done.stderr
     assert track(made, video, tmp_path / "q.csv", *LONE).exit_code == 0
     one, other = pd.read_csv(tmp_path / "q.csv"), pd.read_csv(tmp_path / "p.csv")
     assert one["flag"].equals(other["flag"])

@@ -45,12 +45,12 @@ def test_other_markers_than_the_requested_ones(made):
     words = refusal(made, made.video("empty", count=3), *LONE, "--id", 4)
     assert "marker 4 in none of 3 frames" in words
     five = made.video("five", FIVE, count=3)
-    assert "marker 3 of 5X5_50; expected --dictionary 5X5_50" in refusal(made, five, *LONE)
+    assert "marker 3 of 5X5_50 in view; expected --dictionary 5X5_50" in refusal(made, five, *LONE)
     words = refusal(made, five, *LONE, "--id", 3)
     assert "marker 3 of the dictionary 5X5_50" in words
     both = made.video("two", ROBOT, OTHER, count=3)
     assert "markers 0, 7 in view; expected --id" in refusal(made, both, *LONE)
-    assert "but markers 0, 7; expected --id 0" in refusal(made, both, *LONE, "--id", 4)
+    assert "but markers 0, 7 in view; expected --id 0" in refusal(made, both, *LONE, "--id", 4)
 
 
 def test_region_decides_between_several(made, tmp_path):
@@ -64,7 +64,7 @@ def test_region_decides_between_several(made, tmp_path):
     elsewhere = refusal(made, both, *LONE, "--region", "0,0,40,40")
     assert "no marker of any dictionary" in elsewhere
     outside = refusal(made, both, *LONE, "--id", 0, "--region=-9,-9,-1,-1")
-    assert "--region is outside the picture" in outside
+    assert "--region is outside the image" in outside
     assert "expected four whole numbers" in refusal(made, both, *LONE, "--region", "1,2")
 
 
@@ -77,7 +77,7 @@ SIZES = {
     "below the camera": ("--marker-size", 0.131, "--marker-height", 1.7),
     "expected --marker-size and": ("--marker-size", 0.131),
     "no marker dictionary '4X4_5'": (*LONE, "--dictionary", "4X4_5"),
-    "expected frames per second": (*LONE, "--fps", 0),
+    "expected a positive number of frames per second": (*LONE, "--fps", 0),
     "--seconds is for devices": (*LONE, "--seconds", 3),
     "no frame 99; expected 0 to 19": (*LONE, "--preview", "look.png", "--preview-frame", 99),
 }
@@ -87,7 +87,7 @@ def test_no_file_of_another_kind_is_lost(made, tmp_path):
     log = tmp_path / "run07.csv"
     log.write_text("time,ticks_1\n0.0,1\n")
     video = made.video("robot", ROBOT)
-    assert "would be lost" in refusal(made, video, *LONE, out=log)
+    assert "would be overwritten" in refusal(made, video, *LONE, out=log)
     assert log.read_text() == "time,ticks_1\n0.0,1\n"
     assert ".csv or .parquet" in refusal(made, video, *LONE, out=tmp_path / "a.xlsx")
     assert not (tmp_path / "a.xlsx").exists()
@@ -106,16 +106,16 @@ def test_sources_that_cannot_be_read(made, tmp_path):
     (tmp_path / "zero.avi").write_bytes(b"")
     assert "the file is empty" in refusal(made, tmp_path / "zero.avi", *LONE)
     (tmp_path / "folder").mkdir()
-    assert "no picture" in refusal(made, tmp_path / "folder", *LONE, "--fps", 30)
+    assert "no image" in refusal(made, tmp_path / "folder", *LONE, "--fps", 30)
     cv2.imwrite(str(tmp_path / "folder" / "a.png"), STAGE.frame(0.0, [ROBOT]))
     assert "--fps or --times" in refusal(made, tmp_path / "folder", *LONE)
-    assert "expected --seconds, the length" in refusal(made, 99, *LONE)
-    assert "cannot open it" in refusal(made, 99, *LONE, "--seconds", 1)
+    assert "expected --seconds with the recording's duration" in refusal(made, 99, *LONE)
+    assert "cannot open this source" in refusal(made, 99, *LONE, "--seconds", 1)
     (tmp_path / "t.csv").write_text("frame,time\n0,0\n1,0\n", encoding="utf-8")
     video = made.video("robot", ROBOT)
     assert "times that increase" in refusal(made, video, *LONE, "--times", tmp_path / "t.csv")
     both = ("--times", tmp_path / "t.csv", "--fps", 30)
-    assert "at once" in refusal(made, video, *LONE, *both)
+    assert "both --fps and --times are given" in refusal(made, video, *LONE, *both)
 
 
 def test_cameras_that_do_not_fit(made, tmp_path):
@@ -125,7 +125,7 @@ def test_cameras_that_do_not_fit(made, tmp_path):
     del lens["place_m"]
     (tmp_path / "camera.json").write_text(json.dumps(lens), encoding="utf-8")
     video = made.video("robot", ROBOT)
-    assert "a lens without a place above" in refusal(Made(tmp_path), video, *LONE)
+    assert "a lens without a pose above" in refusal(Made(tmp_path), video, *LONE)
     (tmp_path / "camera.json").unlink()
     assert "No such file" in refusal(Made(tmp_path), video, *LONE)
 
@@ -140,7 +140,9 @@ def test_unwritable_files_are_reported_before_the_work(made, tmp_path, monkeypat
     words = (*LONE, "--id", 0)
     assert "cannot be written" in refusal(made, video, *words, out=tmp_path / "file" / "p.csv")
     assert "a folder; expected the name" in refusal(made, video, *words, out=tmp_path)
-    assert "expected .png" in refusal(made, video, *words, "--preview", tmp_path / "p.docx")
+    assert "a name that ends in .png or .jpg" in refusal(
+        made, video, *words, "--preview", tmp_path / "p.docx"
+    )
     blocked = tmp_path / "file" / "p.png"
     assert "cannot be written" in refusal(made, video, *words, "--preview", blocked)
 
@@ -148,8 +150,8 @@ def test_unwritable_files_are_reported_before_the_work(made, tmp_path, monkeypat
 WRONG_TARGETS = {
     "": "target",
     "[[target]]": "no marker; expected",
-    TARGETS.replace('"two"', '"one"'): "two targets with one name",
-    TARGETS.replace("first_id = 7", "first_id = 0"): "marker 0 twice",
+    TARGETS.replace('"two"', '"one"'): "two targets have the same name",
+    TARGETS.replace("first_id = 7", "first_id = 0"): "marker 0 occurs twice",
     TARGETS.replace("first_id = 7", "first_id = 50"): "marker 50; expected 0 to 49",
     TARGETS.replace("0.131", "-1.0"): "size_m",
     TARGETS.replace("height_m", "hight_m"): "height_m",

@@ -155,7 +155,7 @@ def test_way_points_are_refused_with_the_reason():
         reference.rectangle(speed=-0.2)
     with pytest.raises(ValueError, match="twice in succession"):
         reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
-    with pytest.raises(ValueError, match="each different from the last"):
+    with pytest.raises(ValueError, match="each different from the previous point"):
         reference.curve([(0.0, 0.0), (0.0, 0.0)])
     with pytest.raises(ValueError, match="expected positive numbers"):
         reference.circle(speed=0.0)
@@ -401,7 +401,9 @@ def test_a_robot_can_be_restricted_to_some_floors(deployed):
     with pytest.raises(ValueError, match=f"no floor 'ice'; identified: {a}, {b}"):
         deployed.on("ice")
     for wrong in ((), (a, a)):
-        with pytest.raises(ValueError, match=f"expected different names out of {a}, {b}"):
+        with pytest.raises(
+            ValueError, match=f"expected one or more of {a}, {b}, each at most once"
+        ):
             deployed.on(*wrong)
 
 
