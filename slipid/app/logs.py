@@ -21,7 +21,7 @@ from slipid.support.progress import Reporter
 def read_dataset(
     config: Config, sections: Sequence[LogsSection], root: Path, report: Reporter
 ) -> tuple[Runs, list[str]]:
-    """Return the runs of some log sections, and lines about what was left out.
+    """Return the runs of some log sections, and a line about each log that was left out.
 
     Args:
         config: the config.

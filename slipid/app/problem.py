@@ -1,9 +1,9 @@
 """Set-up of the fit task and of the likelihood from a config and a data folder.
 
-Priors of the load shares follow from scales under the wheels, or from masses at known places: a
-mass m at p adds weights n_i on the wheels at p_i, with sum n_i = m and sum n_i p_i = m p. For three
-wheels the solution is unique; for more wheels, the minimum-norm solution is taken, as if all wheels
-were equally stiff.
+Priors of the load shares follow from scales under the wheels, or from masses at known positions: a
+mass m at position p adds weights n_i on the wheels at p_i, with sum n_i = m and sum n_i p_i = m p.
+For three wheels the solution is unique; for more wheels, the minimum-norm solution is taken, as if
+all wheels were equally stiff.
 """
 
 import fnmatch

@@ -2,10 +2,10 @@
 
 The columns of commanded or reported speeds may be in another order than those of the encoders; this
 can be found from a single run. The channels of commanded and of reported speeds may be exchanged: a
-command precedes the motion and is constant between its changes. If they are exchanged, the channel
-declared as the command changes later than the one declared as the measured speed, and in more rows.
-The sign and order of currents and voltages are found from the work of the motors, their units from
-the currents, voltages and power that are plausible for a robot.
+command precedes the motion and is constant between its changes. If the two channels are exchanged,
+the channel declared as the command changes later than the one declared as the measured speed, and
+in more rows. The sign and order of currents and voltages are found from the work of the motors,
+their units from the currents, voltages and power that are plausible for a robot.
 """
 
 from collections.abc import Iterator, Sequence
@@ -306,7 +306,7 @@ def _other_order(
 
 
 def _share(work: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "*any"]:
-    """Return the share of work: the sum over steps over the sum of magnitudes [1].
+    """Return the share of work: the sum over steps, divided by the sum of the magnitudes [1].
 
     It is 1 if all values are positive, -1 if all are negative, and 0 if all are zero.
     """

@@ -38,9 +38,9 @@ from slipid.data.check.joined import (
 )
 
 LEAST_TURNING = 0.01
-"""Least share of rotation in the predicted motion for which rotations are compared [1]."""
+"""Least fraction of rotation in the predicted motion for which rotations are compared [1]."""
 LEAST_TRANSLATION = 0.02
-"""Least share of translation in the predicted motion for which translations are compared [1]."""
+"""Least fraction of translation in the predicted motion for which translations are compared [1]."""
 SAME_DATA = 1e-6
 """Relative difference between the wheels' angle and their integrated speed below which the angle
 was computed from the speed [1]."""

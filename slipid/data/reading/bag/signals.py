@@ -1,6 +1,7 @@
 """Signals of channels, poses and twists from the numbers in the messages of topics.
 
-The rows are sorted by time on the clock that the layout selects; repeated times are left out.
+The rows are sorted by time on the clock that the layout selects; of rows with the same time, only
+the last is kept.
 """
 
 from collections.abc import Sequence
