@@ -1,4 +1,4 @@
-"""`slipid calibrate`: calibrate the lens of an overhead camera and its place above the floor."""
+"""`slipid calibrate`: calibrate the lens of an overhead camera and its pose above the floor."""
 
 import math
 from pathlib import Path

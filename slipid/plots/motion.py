@@ -118,7 +118,7 @@ def path_figure(
     All paths start at the origin with the robot facing right.
 
     Args:
-        model: force balance that predicts, with shared effects as in the table of errors.
+        model: force balance that predicts the paths, including shared effects of fitted runs.
         data: the runs.
         order: (floor, load set-up) of the panels in order.
         title: title of the figure, which names the set of runs.

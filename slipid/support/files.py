@@ -39,7 +39,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def writable(folder: Path) -> None:
     """Make a folder and raise `DataError` if it is not writable.
 
-    It is called before long work whose results are written to the folder.
+    Call it before long work whose results will be written to the folder.
     """
     write_bytes(folder / ".writable", b"")
     (folder / ".writable").unlink()

@@ -69,7 +69,7 @@ ROWS: Mapping[str, ControllerRow] = {
         "encoder", "law of Indiveri, whose speed limit keeps the direction", law=_indiveri
     ),
 }
-"""Controllers by name: those of slipid and of the 2021 paper, then the published laws."""
+"""Controllers keyed by name: slipid's and the 2021 paper's, then the published control laws."""
 
 
 def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:

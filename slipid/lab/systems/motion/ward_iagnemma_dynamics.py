@@ -242,7 +242,8 @@ def measurements(run: RunSignals, spec: RobotSpec) -> tuple[np.ndarray, ...]:
 def motor_forces(run: RunSignals, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
     """Return the motor force along each drive's motion from its current [N].
 
-    It is the gear ratio times C_e I / r; NaN for wheels that do not drive, or without currents.
+    The force is the gear ratio times C_e I / r. It is NaN for wheels that do not drive, and for all
+    wheels if there are no currents.
     """
     rim = np.abs(run.speed * spec.wheel_radius)
     if run.current is None:
