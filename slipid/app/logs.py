@@ -78,7 +78,7 @@ def required_files(
 def files_of(
     config: Config, sections: Sequence[LogsSection], root: Path
 ) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
-    """Return the log sections that have files, each with its files, and a line about each other."""
+    """Return the log sections that have files, with their files, and lines about the rest."""
     found: list[tuple[LogsSection, list[Path]]] = []
     skipped: list[str] = []
     for section in sections:

@@ -129,7 +129,7 @@ def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | 
     """Return the clock offset and drift from Gauss-Newton iterations.
 
     The regression matrix B is profiled out. The result is None if the iterations do not converge,
-    or leave the searched range around the given offset [s].
+    or move by more than `FINE_HALF_WIDTH_S` from the given offset [s].
     """
     middle = 0.5 * float(steps.first[0] + steps.last[-1])
     grid = offset + np.arange(-FINE_HALF_WIDTH_S, FINE_HALF_WIDTH_S + FINE_GRID_S, FINE_GRID_S)

@@ -58,7 +58,10 @@ def pose_lag(data: Runs) -> PoseLag | None:
 
 
 def _searched(data: Runs) -> PoseLag | None:
-    """Return the lag from a search on a coarse grid and one on a fine grid around its best lag."""
+    """Return the lag from a coarse search and a fine search around its best lag.
+
+    The result is None if the best lag of the coarse search is not clear, or is at its limit.
+    """
     some = np.unique(np.linspace(0, len(data) - 1, MOST_RUNS).round().astype(int)).tolist()
     pairs = [pair for k in some if len((pair := _pair(data, k)).pose_time) > 1]
     if not pairs:

@@ -163,7 +163,7 @@ SHARE_OF_POWER = 0.1
 wheels turn forwards and below its negative while they turn backwards [1]."""
 MOST_A_PER_KG = 2.5
 """Slope of the largest plausible current of one motor, `MOST_A + MOST_A_PER_KG * mass` [A/kg];
-wheeled robots do not draw more continuously."""
+wheeled robots do not draw more for long."""
 MOST_A = 8.0
 """Constant part of the largest plausible current of one motor [A]."""
 MOST_A_WITHOUT_MASS = 200.0
@@ -171,7 +171,7 @@ MOST_A_WITHOUT_MASS = 200.0
 LEAST_A = 0.005
 """Current of a driving motor below which its unit must be wrong [A]."""
 MOST_V, LEAST_V = 200.0, 0.2
-"""Largest and smallest plausible voltages of the motors of such robots [V]."""
+"""Largest and smallest plausible voltages of a wheeled robot's motors [V]."""
 PLAUSIBLE_POWER = (0.003, 60.0)
 """Plausible range of the electrical power over weight times speed, P / (m g v) [1], for robots on
 any slope and surface."""

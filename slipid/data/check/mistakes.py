@@ -32,7 +32,7 @@ MOST_PERMUTED = 6
 
 @dataclass(frozen=True)
 class Candidate:
-    """A candidate interpretation, which corrects one mistake more than the current one.
+    """A candidate interpretation, which corrects one mistake of the current interpretation.
 
     Attributes:
         kind: name of the kind of mistake.

@@ -141,7 +141,7 @@ def _gyro(
 ) -> float | None:
     """Return the ratio of rotation by the gyro to that of the poses.
 
-    It is None if there is no gyro, or if their correlation is below 0.5.
+    It is None if there is no gyro, or if gyro and heading have a correlation below 0.5.
     """
     if moved.gyro is None:
         return None
@@ -160,7 +160,8 @@ def _gyro(
 def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
     """Return the ratio of reported to encoder wheel speeds, and whether they are the same data.
 
-    The ratio is None if no speeds were reported, no wheel turns, or they are the same data.
+    They are the same data if the wheel angle is the integral of the reported speed. The ratio is
+    None in this case, if no speeds were reported, or if no wheel turns.
     """
     if "wheel_speed" not in data.channels:
         return None, False

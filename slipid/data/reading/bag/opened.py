@@ -142,7 +142,7 @@ def _source(reader: "Reader") -> Callable[..., Iterator[Any]]:
 
 @contextmanager
 def open_bag(path: Path, definitions: Path | None) -> Iterator[OpenBag]:
-    """Return a context manager that opens a bag for reading, and closes it at its end.
+    """Return a context manager that opens a bag for reading, and closes it on exit.
 
     Args:
         path: a .bag, .db3 or .mcap file, the folder of a rosbag2, or the metadata.yaml in it.
