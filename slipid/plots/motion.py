@@ -25,7 +25,7 @@ ROWS = (
 MOST_SPEEDS = 4
 """Largest number of speeds that are drawn."""
 STRAIGHT_RUNS, OTHER_RUNS = 16, 3
-"""Largest number of runs in a panel of paths, if all runs are straight, and otherwise."""
+"""Largest numbers of runs in a panel of paths: if all runs are straight, and otherwise."""
 LEAST_OCTANTS = 5
 """Smallest number of octants of headings with straight segments for a panel over heading."""
 

@@ -30,7 +30,9 @@ def write_bytes(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+        raise DataError(
+            f"{path}: cannot be written ({error.strerror}); expected a writable folder"
+        ) from error
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)

@@ -218,7 +218,7 @@ def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
 
 
 def leave_one_surface_out(logs: Iterable[Log]) -> Content:
-    """Return the errors in slip on each surface, of curves fitted elsewhere or to the surface.
+    """Return, for each surface, the slip errors of curves fitted to other surfaces or to itself.
 
     Poses are used as the camera logged them, without correction of its scale and lag.
 

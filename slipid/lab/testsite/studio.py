@@ -183,8 +183,8 @@ def film(
         written = cv2.VideoCapture(str(unfinished)).get(cv2.CAP_PROP_FRAME_COUNT)
         if written != len(frames):
             raise DataError(
-                f"{path}: only {written:.0f} of {len(frames)} frames were written; is the disk "
-                "full?"
+                f"{path}: only {written:.0f} of {len(frames)} frames were written; expected "
+                "enough space on the disk"
             )
         os.replace(unfinished, path)
     finally:

@@ -81,7 +81,7 @@ def deployed(robot: Robot) -> DeployedRobot:
 
 
 BEND_RATIOS = (0.17, 0.45)
-"""Smallest ratio L |W| / (|v| + L |W|) that counts as a bend, and as turning on the spot.
+"""Smallest ratios L |W| / (|v| + L |W|) at which motion counts as a bend and as a turn on the spot.
 
 v is the velocity [m/s], W the yaw rate [rad/s] of the rolling wheels, and L the base radius [m].
 """

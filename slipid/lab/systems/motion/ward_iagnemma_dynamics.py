@@ -143,7 +143,7 @@ class Dynamics:
         slope[:, range(3), range(3)] -= linear
         rate = (traction @ self.rims - linear * q) * _OVER_MASS
         slope *= _OVER_MASS[:, None]
-        # the term W (vy, -vx), since the axes of q turn with the body
+        # add the term W (vy, -vx), since the axes of q turn with the body
         yaw = q[:, 2] / self.base_radius
         rate[:, 0] += yaw * q[:, 1]
         rate[:, 1] -= yaw * q[:, 0]
