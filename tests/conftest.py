@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 from ctypes import CDLL
 from ctypes.util import find_library
+from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
@@ -40,6 +41,10 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 plain_loops()
+# Workers use all cores already: code that is generated in several parts costs more CPU time.
+if version("jaxlib").startswith(("0.10.", "0.11.", "0.12.")):
+    whole = "--xla_cpu_parallel_codegen_split_count=1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {whole}".strip()
 os.environ["MPLBACKEND"] = "Agg"
 # MuJoCo chooses at its first import what it draws with; without EGL it must not be told to use it.
 if find_library("EGL"):

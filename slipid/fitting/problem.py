@@ -340,7 +340,7 @@ class Twists(NamedTuple):
         return cls(none, more, more)
 
 
-class Linearised(NamedTuple):
+class ResidualsAt(NamedTuple):
     """Residuals at a search vector.
 
     Attributes:
@@ -358,7 +358,7 @@ class Linearised(NamedTuple):
 
 def linear(
     objective: Objective, z: Vector, electric: lk.ElectricNoise, near: Twists | None = None
-) -> Linearised:
+) -> ResidualsAt:
     """Return residual blocks, their Jacobians, and the forces of every motor.
 
     `near` holds the twists at a search vector close to z, which make the root finder faster.
@@ -371,7 +371,7 @@ def linear(
 @eqx.filter_jit
 def linear_given(
     objective: Objective, z: Vector, electric: lk.ElectricNoise, given: GivenMotion, near: Twists
-) -> Linearised:
+) -> ResidualsAt:
     """Return residual blocks, their Jacobians, and the forces of every motor.
 
     Both kinds of electric residuals are compiled together: to compile them apart would take longer
@@ -379,7 +379,7 @@ def linear_given(
     """
     space, batch = objective.space, objective.batch
 
-    def blocks(x: Array) -> tuple[Blocks, Linearised]:
+    def blocks(x: Array) -> tuple[Blocks, ResidualsAt]:
         robot = space.tree(x)
         electrical = space.tree(jnp.where(given.applies & ~space.electric, given.z, x))
         p = lk.predict(robot, batch, near.steady)
@@ -399,11 +399,11 @@ def linear_given(
             out |= of.residuals(electrical, theirs)
             out[MULTI_FLOOR_MOTION] = of.residuals(robot, mine)[MULTI_FLOOR_MOTION]
             twists = Twists(p.twist, mine.twist, theirs.twist)
-        return out, Linearised(out, {}, force, twists)
+        return out, ResidualsAt(out, {}, force, twists)
 
     direction = np.arange(space.size) if objective.multi_floor else _directions(space)
 
-    def along(change: Array) -> tuple[Blocks, Linearised]:
+    def along(change: Array) -> tuple[Blocks, ResidualsAt]:
         return jax.jvp(blocks, (jnp.asarray(z),), (change,), has_aux=True)[1:]
 
     changes = (np.arange(direction.max(initial=-1) + 1)[:, None] == direction).astype(float)
