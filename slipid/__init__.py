@@ -5,7 +5,7 @@ Every name below is loaded at its first use: importing slipid loads and changes 
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # Type checkers recognise this name, without loading `typing`.
+TYPE_CHECKING = False  # type checkers take it as True; importing it would load `typing`
 if TYPE_CHECKING:
     from slipid.api.camera import track as track
     from slipid.api.fit import Prior as Prior

@@ -1,7 +1,6 @@
 """Search space of a fit: its free parameters as one vector without bounds, and the user's choices.
 
-Here a "number" of a module tree is one parameter declared with `slipid.parameter`: a scalar or a
-small vector.
+A parameter of a module tree is a scalar or a small vector, declared with `slipid.parameter`.
 """
 
 import fnmatch
@@ -23,14 +22,14 @@ HELD = 1e-4
 
 @dataclass(frozen=True)
 class Choice:
-    """The user's choice for all numbers whose path matches a pattern.
+    """The user's choice for all parameters whose path matches a pattern.
 
     Attributes:
         pattern: path, with `*` and `?` as wildcards: `surface.*.creep`.
-        start: start value [SI], which is also the value of a number that is not fitted.
-        fixed: value at which the number is fixed [SI]; None does not fix it.
-        free: True to fit the number, False to keep it at its start value, None to keep the default.
-        prior_mean: mean of the prior [SI]; a number with a prior is fitted.
+        start: start value [SI], which is also the value of a parameter that is not fitted.
+        fixed: value at which the parameter is fixed [SI]; None does not fix it.
+        free: True to fit the parameter, False to keep it at its start value, None for the default.
+        prior_mean: mean of the prior [SI]; a parameter with a prior is fitted.
         prior_std: std of the prior [SI], one value or one per element; without `prior_mean`, the
             prior is centred on the declared start value, or on equal fractions (`shares`).
     """
@@ -44,19 +43,19 @@ class Choice:
 
 
 class Space(eqx.Module):
-    """The free numbers of a tree as one vector without bounds, with their Gaussian prior.
+    """The free parameters of a tree as one vector without bounds, with their Gaussian prior.
 
     A space is passed to compiled functions as an argument, so that spaces with the same parameters
     share these functions.
 
     Attributes:
-        template: tree with the values of the fixed numbers and the start values of the free ones.
+        template: tree with the values of fixed parameters and the start values of free ones.
         start, prior_mean, prior_std: start vector, and mean and std of the prior, in the search
             space.
         pooled: mask of the coordinates of deviations (`Declaration.deviation`) whose prior std is
             estimated from the data because the user gave none.
-        all: every declared number of the tree.
-        free: the numbers that are fitted.
+        all: every declared parameter of the tree.
+        free: the parameters that are fitted.
     """
 
     template: Any
@@ -68,7 +67,7 @@ class Space(eqx.Module):
     free: tuple[Entry, ...] = eqx.field(static=True)
 
     def __init__(self, tree: Any, choices: Sequence[Choice] = ()):
-        """Build the space of a module with declared numbers; later choices override earlier ones.
+        """Build the space of a module tree; later choices override earlier ones.
 
         Raises:
             ValueError: a pattern matches no path, a value breaks the rules of its declaration, or
@@ -106,12 +105,12 @@ class Space(eqx.Module):
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Slice of the search vector that holds each free number, keyed by its path."""
+        """Slice of the search vector that holds each free parameter, keyed by its path."""
         ends = np.cumsum([0, *(e.coordinates for e in self.free)]).tolist()
         return {e.path: slice(a, b) for e, a, b in zip(self.free, ends, ends[1:], strict=False)}
 
     def where(self, wanted: Callable[[Entry], bool]) -> Bool[np.ndarray, " free"]:
-        """Return a mask of the coordinates for whose number `wanted` is true."""
+        """Return a mask of the coordinates for whose parameter `wanted` is true."""
         count = [e.coordinates for e in self.free]
         return np.repeat(np.array([wanted(e) for e in self.free], bool), count)
 
@@ -132,7 +131,7 @@ class Space(eqx.Module):
 
     @property
     def names(self) -> list[str]:
-        """One name per coordinate: the path of its number, with an index if it has several."""
+        """One name per coordinate: the path of its parameter, with an index if that has several."""
         return [
             e.path if e.coordinates == 1 else f"{e.path}[{k + 1}]"
             for e in self.free
@@ -147,7 +146,7 @@ class Space(eqx.Module):
         )
 
     def vector(self, tree: Any) -> np.ndarray:
-        """Return the search-space vector of a tree's free numbers."""
+        """Return the search-space vector of a tree's free parameters."""
         parts = [e.declaration.to_search(np.asarray(e.get(tree))) for e in self.free]
         return np.concatenate([np.zeros(0), *parts])
 

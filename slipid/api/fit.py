@@ -106,5 +106,5 @@ def fit_task_of(
 
 
 def _json_numbers(value: Numbers) -> float | list[float]:
-    """Return a number, or several numbers as a list, in types that JSON has."""
+    """Return a number as a float, or several numbers as a list, as in a JSON file."""
     return np.asarray(value, float).tolist()

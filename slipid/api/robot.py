@@ -80,7 +80,7 @@ def drive(
 
     Raises:
         ValueError: there is no such controller or start, or no controller for the robot's wheels.
-        DataError: there is no such path or map, the speed is higher than those of the fitted runs,
+        DataError: there is no such path or map, the speed is higher than that of any fitted run,
             or the map has a floor that was not identified.
     """
     if not robot.steers:

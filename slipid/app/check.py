@@ -193,7 +193,7 @@ def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
 
 
 def _clock(clock: Clock) -> Content:
-    """Return the part of check.json about the clock of a run's poses, with its 90 % interval."""
+    """Return the part of check.json about the clock offset of a run's poses, and its drift."""
     return {
         "offset_s": clock.offset,
         "offset_interval90_s": clock.offset_interval90,

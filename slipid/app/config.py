@@ -309,9 +309,9 @@ class SelftestSection(Section):
         speeds_m_s: speeds of the runs.
         turns: number of curved runs on each floor with each load set-up.
         distance_m: length of a run.
-        truth: true values of parameters in the simulation, by the name of the parameter.
+        truth: true values of parameters in the simulation, keyed by the name of the parameter.
         wanted: patterns of the names of the parameters that must be recovered; by default all free
-            ones.
+            parameters.
     """
 
     surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
@@ -333,7 +333,7 @@ class ConfigContent(Section):
         logs: one section for each set of log files with the same layout, floor and load.
         camera: the camera, or another sensor, that measured the poses.
         parameters: start values, fixed values and priors of parameters, by patterns of their names.
-        weights: known weights on the wheels, by the name of the load set-up.
+        weights: known weights on the wheels, keyed by the name of the load set-up.
         fit: division of the runs into windows, end of the fit, and known lengths.
         selftest: runs that `slipid selftest` simulates if it is given no logs.
         validate: runs that `slipid validate` predicts instead of the fitted ones.

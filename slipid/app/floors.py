@@ -86,7 +86,7 @@ def floors_under(
     if not any(run.inside.any() for run in found):
         x, y = np.concatenate([run.pose for run in found])[0, :2]
         raise DataError(
-            f"{map_file}: no wheel of any run is on this map (the first stands at x {x:.2f} m, "
+            f"{map_file}: no wheel of any run is on this map (the first run begins at x {x:.2f} m, "
             f"y {y:.2f} m); expected a map in the frame of the poses"
         )
     return lookup, found

@@ -21,7 +21,7 @@ from slipid.support.progress import Reporter
 def read_dataset(
     config: Config, sections: Sequence[LogsSection], root: Path, report: Reporter
 ) -> tuple[Runs, list[str]]:
-    """Return the runs of some log sections, and lines about what was left out.
+    """Return the runs of some log sections, and a line about each log that was left out.
 
     Args:
         config: the config.
@@ -78,7 +78,7 @@ def required_files(
 def files_of(
     config: Config, sections: Sequence[LogsSection], root: Path
 ) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
-    """Return the log sections that have files, each with its files, and a line about each other."""
+    """Return the log sections that have files, with their files, and lines about the rest."""
     found: list[tuple[LogsSection, list[Path]]] = []
     skipped: list[str] = []
     for section in sections:

@@ -1,9 +1,9 @@
 """Set-up of the fit task and of the likelihood from a config and a data folder.
 
-Priors of the load shares follow from scales under the wheels, or from masses at known places: a
-mass m at p adds weights n_i on the wheels at p_i, with sum n_i = m and sum n_i p_i = m p. For three
-wheels the solution is unique; for more wheels, the minimum-norm solution is taken, as if all wheels
-were equally stiff.
+Priors of the load shares follow from scales under the wheels, or from masses at known positions: a
+mass m at position p adds weights n_i on the wheels at p_i, with sum n_i = m and sum n_i p_i = m p.
+For three wheels the solution is unique; for more wheels, the minimum-norm solution is taken, as if
+all wheels were equally stiff.
 """
 
 import fnmatch
@@ -269,11 +269,12 @@ def fit_task(
         )
     robot = robot_for_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
-    # The choices of the config come last, since later choices override earlier ones.
+    # A lag that the config sets is not replaced by the lag that the motion shows.
     given = any(fnmatch.fnmatchcase("camera.lag", p) for p in config.content.parameters)
     lag = [] if given else lag_from_motion(dataset)
     known = [*lag, *without_rollers(shape), *fixed_viscosities(dataset)]
     trusted = config.content.fit.lengths_from
+    # The choices of the config come last, since later choices override earlier ones.
     choices = [*known, *choices]
     if trusted is not None and {*FREE_LENGTH.values()} <= {
         e.path for e in Space(robot, choices).free
@@ -305,7 +306,8 @@ def lag_from_motion(dataset: Runs) -> list[Choice]:
 def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
     """Return choices that free one of wheel radius and camera scale, and hold the other fixed.
 
-    `trusted` is the kind of lengths that are known, as in `FitSection.lengths_from`.
+    `trusted` is the kind of lengths that are known, as in `FitSection.lengths_from`: "poses" frees
+    the wheel radius, "wheels" the camera scale, and None returns no choices.
     """
     if trusted is None:
         return []
@@ -398,7 +400,7 @@ def unknown_parameter(config: Config, pattern: str, name: str, paths: list[str])
 
 
 def checked_choice(config: Config, pattern: str, name: str, root: Robot | BenchRoot) -> Choice:
-    """Return the choice that `[parameters]` has at a pattern.
+    """Return the choice under a pattern of `[parameters]`.
 
     Args:
         config: the config.

@@ -54,7 +54,7 @@ def sample(
     report.stage("compiling")
     fit = replace(fit, problem=task.problem(fit.robot), data=task.dataset)
     # The key has everything that the draws depend on. The largest length of the chain is not part
-    # of the key, so that a finished chain can be continued with a larger limit.
+    # of the key, so that a chain that ended at the limit can be continued with a larger limit.
     inputs = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
     kept = Checkpoint(out / FOLDER, key_of(*inputs, np.asarray(fit.z), np.asarray(fit.covariance)))
     posterior = sampled(fit, plan, draws, kept, report)

@@ -1,4 +1,4 @@
-"""`slipid calibrate`: calibrate the lens of an overhead camera and its place above the floor."""
+"""`slipid calibrate`: calibrate the lens of an overhead camera and its pose above the floor."""
 
 import math
 from pathlib import Path
@@ -138,7 +138,10 @@ def _refuse_combinations(
 ) -> None:
     """Raise `DataError` if options contradict each other; `words` are the pictures of a board."""
     if bool(words) == (camera is not None):
-        raise DataError("expected either pictures of a board, or --camera FILE with a known lens")
+        raise DataError(
+            "the lens must come from a single source; expected either pictures of a board, or "
+            "--camera FILE with a known lens"
+        )
     if floor is not None and points is not None:
         raise DataError(
             "both --floor and --points are given; expected only one of them, since each "

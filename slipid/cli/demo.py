@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from slipid.app.identify import IdentifyResult
 
 PARTS = ("fit", "unseen")
-"""Folders of the runs that are fitted and of those that are predicted.
+"""Names of the folders of fitted runs and of predicted runs.
 
-The config of each is `testsite_<part>.toml`."""
+The config of each part is `testsite_<part>.toml`."""
 
 
 @guarded

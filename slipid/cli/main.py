@@ -63,7 +63,7 @@ def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
     """
     if lost.exc_type is KeyboardInterrupt:
         again = threading.Timer(AGAIN_S, _thread.interrupt_main)
-        again.daemon = True  # The program can exit without waiting for a daemon thread.
+        again.daemon = True  # so that the program can exit without waiting for the timer
         again.start()
     else:
         sys.__unraisablehook__(lost)

@@ -189,7 +189,7 @@ class PicturedFile(Section):
 
 
 def read_map(path: Path) -> FloorMap:
-    """Return the map in a file: TOML or, with the suffix `.geojson`, a map written by `slipid map`.
+    """Return the map in a TOML file, or in a `.geojson` file that `slipid map` wrote.
 
     A TOML file has either `base`, `extent_m` and `[[patch]]`, or `picture` and `[colours]`.
 

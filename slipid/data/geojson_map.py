@@ -54,7 +54,7 @@ class MapRegion(Section):
         base: the surface that covers most of the floor.
         colours: colour `#rrggbb` of each surface, in the order of the floor map.
         picture_sha256: SHA-256 hash of the picture file in which the patches were detected.
-        unknown_share: share of the region that no patch covers [1].
+        unknown_share: fraction of the region that no patch covers [1].
         notes: remarks for the reader of the file, one sentence each.
     """
 

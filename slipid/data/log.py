@@ -20,7 +20,8 @@ class Log:
             a suffix such as `#03` is added.
         path: path of the file.
         sha256: SHA-256 hash of the file's bytes.
-        time: time [s], strictly increasing; it starts at 0 if the logged clock counts from 1970.
+        time: time [s], strictly increasing; times that are logged as seconds since 1970 are shifted
+            to start at 0.
         wheel_angle: angle of each wheel [rad], cumulative from the first row, interpolated linearly
             between readings; it has no columns if the log has only poses.
         wheel_speed: reported speed of each wheel [rad/s], or None.

@@ -185,7 +185,7 @@ def each_window(
     """Return the results of function `of` for every window, with axes (segment, window, ...).
 
     `of` takes the wheel speeds of a window [rad/s], its element of `near` or None, and the indices
-    of its surface and load. It is mapped over one flat axis of all windows: with two nested axes,
+    of its surface and load. `of` is mapped over one flat axis of all windows: with two nested axes,
     JAX would need 50 % more time for tracing.
     """
     segments, windows = b.dt.shape

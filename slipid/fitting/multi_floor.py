@@ -144,7 +144,7 @@ def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Window
 def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "segment time wheel 2"]:
     """Return positions of the wheel centres in the frame of the map [m].
 
-    They are given at the start, middle and end of the single window of every segment.
+    The positions are those at the start, middle and end of the single window of every segment.
     """
     edges = np.asarray(lk.corrected(robot, jnp.asarray(w.pose)))
     pose = np.stack([edges[:, 0], edges.mean(axis=1), edges[:, 1]], axis=1)

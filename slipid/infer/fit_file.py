@@ -41,7 +41,7 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
     """Write a fit to a folder, replacing a fit there, and return the names of the files.
 
     Raises:
-        ValueError: a number is not finite; in this case nothing is written.
+        ValueError: a value is not finite; in this case nothing is written.
         DataError: the folder cannot be written to.
     """
     arrays = _packed(fit)

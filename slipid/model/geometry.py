@@ -166,7 +166,7 @@ class Geometry(Drives):
         return None
 
     def forward(self) -> Float[Array, "drive 3"]:
-        """Return the matrix from body twist to rim speeds (`WheelFrame.forward`), as calibrated."""
+        """Return the matrix from body twist to the drives' rim speeds, see `WheelFrame.forward`."""
         return self.frame().forward()
 
     def pseudo_inverse(self) -> Float[Array, "3 drive"]:

@@ -64,7 +64,7 @@ class Motor(eqx.Module):
         return self.resistance * current + self.back_emf * wm + drop
 
     def friction(self, wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
-        """Return the friction torque at the wheel [N m], against the motion."""
+        """Return the friction torque at the wheel [N m], with the sign of the wheel speed."""
         return (
             self.coulomb_friction * jnp.tanh(wheel_speed / 0.2)
             + self.viscous_friction * wheel_speed

@@ -48,7 +48,7 @@ def coverage_picture(quality: Quality, path: Path) -> Path:
 def floor_picture(fit: FloorFit, path: Path) -> Path:
     """Write a picture of the floor's axes and grid as the camera sees them, with residuals.
 
-    Residuals are those of the points by which the camera's pose was fitted.
+    The residuals belong to the points to which the camera's pose was fitted.
     """
     width, height = fit.camera.lens.image_px
     title = f"The floor from {fit.camera.height:.3f} m; rms error of points {fit.rms_px:.2f} px"

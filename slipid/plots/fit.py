@@ -163,7 +163,10 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
         raise ValueError(f"no figure '{name}'; expected one of {', '.join(FIGURES)}")
     made = FIGURES[name](fit, data, measured_windows(fit.robot, data, fit.channels.windows))
     if made is None:
-        raise ValueError(f"figure '{name}': the runs lack the data for it")
+        raise ValueError(
+            f"figure '{name}': the runs lack the data for it; expected currents, fitted load "
+            "shares, or straight runs in most directions, as the figure needs"
+        )
     return made
 
 

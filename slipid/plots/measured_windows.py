@@ -32,8 +32,8 @@ class MeasuredWindows:
     Attributes:
         group: index of each segment's floor and load set-up in `groups`.
         groups: pairs (floor, load set-up), sorted from the floor with the smallest median slip.
-        speed: commanded speed of the body, or that by encoders without a command, rounded to
-            0.01 m/s [m/s].
+        speed: commanded speed of the body, or its speed by encoders if there is no command, rounded
+            to 0.01 m/s [m/s].
         heading: direction of travel by encoders in the body frame, 0 to 360 [deg].
         straight: True if the body travels in one direction without a turn.
         slip: 1 - (camera's displacement along the encoders' direction) / (encoders' displacement)

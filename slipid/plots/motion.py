@@ -25,7 +25,7 @@ ROWS = (
 MOST_SPEEDS = 4
 """Largest number of speeds that are drawn."""
 STRAIGHT_RUNS, OTHER_RUNS = 16, 3
-"""Largest number of runs in a panel of paths, if all runs are straight, and otherwise."""
+"""Largest numbers of runs in a panel of paths: if all runs are straight, and otherwise."""
 LEAST_OCTANTS = 5
 """Smallest number of octants of headings with straight segments for a panel over heading."""
 
@@ -118,7 +118,7 @@ def path_figure(
     All paths start at the origin with the robot facing right.
 
     Args:
-        model: force balance that predicts, with shared effects as in the table of errors.
+        model: force balance that predicts the paths, including shared effects of fitted runs.
         data: the runs.
         order: (floor, load set-up) of the panels in order.
         title: title of the figure, which names the set of runs.

@@ -168,7 +168,7 @@ def contradiction(
     else:
         return None
     return (
-        "the runs over several floors were not used, since they contradict those on one floor "
+        "the runs over several floors were not used, since they contradict the runs on one floor "
         f"({reason}); the map may be wrong or misplaced, or the contact law is wrong where wheels "
         "stand on different floors"
     )

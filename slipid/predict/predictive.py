@@ -80,7 +80,7 @@ class PredictiveModel(abc.ABC):
     @property
     @abc.abstractmethod
     def numbers(self) -> dict[str, int]:
-        """Number of fitted parameters without the camera, keyed by floor, or `shared` by floors."""
+        """Number of fitted parameters of each floor, and of those `shared` by all; no camera's."""
 
     def log_variance(self, problem: Problem) -> Float[np.ndarray, " variance"]:
         """Return the log variance of every noise component of a problem."""

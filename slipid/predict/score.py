@@ -25,8 +25,8 @@ class Score:
         predicted_end: predicted pose at the end, x, y [m] and yaw [rad].
         endpoint_error: distance between predicted and measured end point, divided by the measured
             chord (straight-line displacement).
-        endpoint_error_over_path: the same distance divided by the measured path length, which is
-            meaningful on closed paths, too.
+        endpoint_error_over_path: distance between predicted and measured end point, divided by the
+            measured path length; unlike `endpoint_error` it is meaningful on closed paths, too.
         length_error: relative error of the chord.
         heading_error_deg: error of the final heading, at most 180 [deg].
         level: probability of the predicted region on whose boundary the measured end point lies,

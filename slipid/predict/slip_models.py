@@ -1,7 +1,7 @@
 """Slip models that are compared with the force balance, fitted floor by floor.
 
-`slip_models` returns them, `restored` builds fitted ones from files. `FloorModels` fits a model to
-the windows of each floor, `ByFloor` to the runs of each floor.
+`slip_models` returns the models before they are fitted, `restored` builds fitted models from files.
+`FloorModels` fits a model to the windows of each floor, `ByFloor` to the runs of each floor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -201,7 +201,7 @@ def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> l
 
 @dataclass(frozen=True)
 class ByFloor(SlipModel):
-    """A slip model fitted by floor if floors are known, else by load set-up.
+    """A slip model fitted to each floor separately if floors are known, else to each load set-up.
 
     Groups of fewer than `LEAST_RUNS` runs use the fit to all runs.
 

@@ -97,7 +97,7 @@ class Steps:
         memory, x = np.ones((*shape, 1)), np.zeros((*shape, values.shape[1]))
         memory[run, step, 0] = np.exp(-self.signals.dt / time_constant)
         x[run, step] = values
-        # all runs at once: the only loop is over the steps of the longest run
+        # One loop over the steps of the longest run smooths all runs at once.
         for k in range(1, shape[1]):
             x[:, k] += memory[:, k] * (x[:, k - 1] - x[:, k])
         return x[run, step]

@@ -49,7 +49,8 @@ class Processes(ProcessPoolExecutor):
     def submit(
         self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
-        with _interrupts_ignored():  # Ctrl-C then interrupts only this process.
+        # processes that are started here ignore Ctrl-C, which then interrupts only this process
+        with _interrupts_ignored():
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(

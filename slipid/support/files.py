@@ -30,7 +30,9 @@ def write_bytes(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+        raise DataError(
+            f"{path}: cannot be written ({error.strerror}); expected a writable folder"
+        ) from error
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
@@ -39,7 +41,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def writable(folder: Path) -> None:
     """Make a folder and raise `DataError` if it is not writable.
 
-    It is called before long work whose results are written to the folder.
+    Call it before long work whose results will be written to the folder.
     """
     write_bytes(folder / ".writable", b"")
     (folder / ".writable").unlink()

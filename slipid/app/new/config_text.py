@@ -70,7 +70,7 @@ def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock
     """Return the table `[robot]`, with the drawing above it."""
     given = robot.model_dump(exclude_none=True)
     if isinstance(robot, OmniDrive) and robot.roller_angle_deg == 90.0:
-        del given["roller_angle_deg"]  # the default, that of ordinary omni wheels
+        del given["roller_angle_deg"]  # the default: ordinary omni wheels need no line for it
     # The keys of the type of drive come first, those that all robots have after them.
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
     own = (key for key in given if key not in ("drive", *common))

@@ -106,7 +106,8 @@ def _file_channel(
 def rank(label: str) -> tuple[int, int, str]:
     """Return the key by which labels of wheels, or components of a quaternion, are sorted.
 
-    Known labels are in the order of the drives, numbers in their order after them.
+    Known labels come first, in the order in which drives count wheels; numbers follow in increasing
+    order.
     """
     known = (*_QUATERNION, *_ORDER)
     if label in known:
@@ -150,7 +151,7 @@ def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
 
 
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
-    """Return the channels whose wheels match those of the motion, and a line about each other one.
+    """Return the channels whose wheels match those of the motion, and lines about other channels.
 
     The motion is the channel from which the turns of the wheels are computed.
     """

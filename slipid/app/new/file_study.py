@@ -123,9 +123,9 @@ def reading_rate(one: FileStudy, found: FileChannel) -> str:
 def pose_path(
     one: FileStudy | None,
 ) -> tuple[UnitGuess, Float[np.ndarray, "3 pose"] | None]:
-    """Return the unit of the positions in a file, and its path: time [s], x and y [m] of each pose.
+    """Return the unit of the positions in a file, and the time [s], x and y [m] of each pose.
 
-    The path is None if the file has no pose, or none with a time and a length.
+    The latter are None if the file has no pose or no time, or if positions are in pixels.
     """
     if one is None or not one.has_pose:
         return UnitGuess("m"), None
@@ -183,7 +183,7 @@ def pose_over_wheel_speed(
     """Return the ratio of body speed [m/s] to wheel speed [unit of the file] while wheels turn.
 
     If wheel speeds are in rad/s and all wheels point ahead, it is the wheel radius [m]; for other
-    robots it is close to that. The result is None if poses or wheel speeds are missing.
+    robots it is close to the radius. The result is None if poses or wheel speeds are missing.
     """
     if path is None or one.clock is None:
         return None
@@ -329,7 +329,7 @@ class RunStudy:
     def of_supply(self) -> bool:
         """Return whether currents are those of the supply.
 
-        They are then positive in both directions of the wheels, and negative at times.
+        Supply currents are positive in both directions of the wheels, and negative at times.
         """
         both_ways = any(has_magnitudes(*known) for known in self.currents)
         return both_ways and any(np.nanmin(current.values) < 0.0 for current, _ in self.currents)

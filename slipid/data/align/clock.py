@@ -45,7 +45,8 @@ MOST_ITERATIONS, NOISE_ITERATIONS = 20, 6
 """Largest number of Gauss-Newton iterations, and number of the first ones that re-estimate the
 noise."""
 MOST_UNEXPLAINED = 0.5
-"""Largest share of the motion that the regression at the best offset may leave unexplained [1]."""
+"""Largest fraction of the motion that the regression at the best offset may leave unexplained
+[1]."""
 LARGEST_STD_S = 0.03
 """Std above which an offset is discarded [s]."""
 SUFFICIENT_STD_S = 0.005
@@ -62,7 +63,7 @@ class Clock:
         drift: rate of the robot's clock relative to the poses' clock, less one [1].
         drift_std: std of the drift [1].
         middle: time on the poses' clock at which the offset holds [s].
-        unexplained: share of the motion that the regression leaves unexplained [1].
+        unexplained: fraction of the motion that the regression leaves unexplained [1].
         source: sensor that the poses were compared with.
     """
 
@@ -86,10 +87,11 @@ class Clock:
 
 
 def best_clock(pairs: Iterable[MotionPair]) -> Clock | None:
-    """Return the clock of a run's poses from the first motion pair with a sufficient offset std.
+    """Return a run's clock offset and drift from the first motion pair that determines them well.
 
-    The std must be at most `SUFFICIENT_STD_S`; later pairs are not evaluated. If no pair reaches
-    this std, the clock with the smallest std is returned, or None if no pair determines a clock.
+    The std of the offset must be at most `SUFFICIENT_STD_S`; later pairs are not evaluated. If no
+    pair reaches this std, the result is that with the smallest std, or None if no pair determines
+    offset and drift.
     """
     found = []
     for pair in pairs:
@@ -101,7 +103,7 @@ def best_clock(pairs: Iterable[MotionPair]) -> Clock | None:
 
 
 def clock_of_poses(pair: MotionPair) -> Clock | None:
-    """Return the clock of a run's poses, or None if the motion does not determine it."""
+    """Return the clock offset and drift of a run's poses; None if the motion does not show them."""
     if len(pair.pose_time) < LEAST_STEPS or len(pair.time) < LEAST_STEPS:
         return None
     steps = pair.increments(pair.step)
@@ -124,10 +126,10 @@ def _searched(pair: MotionPair) -> float | None:
 
 
 def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | None:
-    """Return the clock from Gauss-Newton iterations in offset and drift.
+    """Return the clock offset and drift from Gauss-Newton iterations.
 
     The regression matrix B is profiled out. The result is None if the iterations do not converge,
-    or leave the searched range around the given offset [s].
+    or move by more than `FINE_HALF_WIDTH_S` from the given offset [s].
     """
     middle = 0.5 * float(steps.first[0] + steps.last[-1])
     grid = offset + np.arange(-FINE_HALF_WIDTH_S, FINE_HALF_WIDTH_S + FINE_GRID_S, FINE_GRID_S)
@@ -167,7 +169,15 @@ def _clock(
     inverse: Float[np.ndarray, "2 2"],
     middle: float,
 ) -> Clock | None:
-    """Return the clock at an optimum, or None if the std of its offset is above `LARGEST_STD_S`."""
+    """Return the clock at an optimum, or None if its offset std is not below `LARGEST_STD_S`.
+
+    Args:
+        pair: motion pair.
+        near: regression linearised at the optimum.
+        at: optimal offset at `middle` [s] and drift [1].
+        inverse: inverse of the normal matrix at the optimum, for offset and drift.
+        middle: time on the poses' clock at which the offset holds [s].
+    """
     std = _spread(near, inverse)
     std[0] = np.hypot(std[0], pair.body_std)
     if not std[0] < LARGEST_STD_S:
@@ -186,7 +196,8 @@ def _clock(
 def _spread(near: Linearised, inverse: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2"]:
     """Return the stds of offset and drift from the scores of blocks, by the sandwich formula.
 
-    They are at least the model-based stds, from the inverse of the normal matrix.
+    The stds are at least the model-based ones, which follow from `inverse`, the inverse of the
+    normal matrix.
     """
     blocks = np.array_split(np.arange(len(near.residual)), BLOCKS)
     scores = np.stack([np.einsum("kci,kc->i", near.slope[b], near.residual[b]) for b in blocks])

@@ -18,8 +18,9 @@ STEP_S = 0.2
 MOST_RUNS = 40
 """Largest number of compared runs, which are picked evenly from all runs."""
 DECISIVE_RATIO, DECISIVE_DROP = 0.75, 0.02
-"""A lag is decisive if the share of the motion that it leaves unexplained is below `DECISIVE_RATIO`
-times the share at zero lag, and lower than that by more than `DECISIVE_DROP` [1]."""
+"""A lag is decisive if the fraction of the motion that it leaves unexplained is below
+`DECISIVE_RATIO` times the fraction at zero lag, and smaller than the latter by more than
+`DECISIVE_DROP` [1]."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,8 @@ class PoseLag:
 
     Attributes:
         seconds: the lag [s], positive if poses are late.
-        unexplained: share of the motion that stays unexplained at this lag [1].
-        unexplained_at_zero: share of the motion that stays unexplained at zero lag [1].
+        unexplained: fraction of the motion that stays unexplained at this lag [1].
+        unexplained_at_zero: fraction of the motion that stays unexplained at zero lag [1].
     """
 
     seconds: float
@@ -57,7 +58,10 @@ def pose_lag(data: Runs) -> PoseLag | None:
 
 
 def _searched(data: Runs) -> PoseLag | None:
-    """Return the lag from a search on a coarse grid and one on a fine grid around its best lag."""
+    """Return the lag from a coarse search and a fine search around its best lag.
+
+    The result is None if the best lag of the coarse search is not clear, or is at its limit.
+    """
     some = np.unique(np.linspace(0, len(data) - 1, MOST_RUNS).round().astype(int)).tolist()
     pairs = [pair for k in some if len((pair := _pair(data, k)).pose_time) > 1]
     if not pairs:

@@ -5,7 +5,7 @@
 where moved_k is the pose increment over step k, from first_k to last_k [s], turned are the angles
 of the wheels or of the gyro, B is the fitted matrix and e_k the noise. Sizes, signs and order of
 the wheels need not be known, since B absorbs them. The speed must change during the motion, because
-steady motion looks the same at any offset. A search compares offsets by the unexplained share of
+steady motion looks the same at any offset. A search compares offsets by the unexplained fraction of
 the motion; near the best offset, `linearised` gives the derivatives with respect to offset and
 drift under a noise model, in which e is the sum of pose noise, which successive steps share, and of
 slip, which is independent in each step.
@@ -147,7 +147,7 @@ LEAST_STEPS = 20
 LEAST_PER_COLUMN = 3
 """Least number of steps per column of `turned` for the regression at a searched offset."""
 DISTANT_S, CLEAR_MARGIN = 0.5, 0.02
-"""The best offset is clear if the unexplained share of the motion at every offset further than
+"""The best offset is clear if the unexplained fraction of the motion at every offset further than
 `DISTANT_S` [s] from it is larger by at least `CLEAR_MARGIN` [1]; steady or periodic motion has no
 clear best offset."""
 
@@ -155,11 +155,11 @@ clear best offset."""
 def unexplained(
     pairs: Sequence[MotionPair], offsets: Float[np.ndarray, " offset"], step: float
 ) -> Float[np.ndarray, " offset"]:
-    """Return the share of the motion that the regression leaves unexplained at each offset.
+    """Return the fraction of the motion that the regression leaves unexplained at each offset.
 
-    One matrix B is fitted to all pairs. The result is the geometric mean of the unexplained shares
-    of the components, which ranks offsets as the profile likelihood does if each component has a
-    separate noise variance. Therefore units do not matter, and a component that cannot be
+    One matrix B is fitted to all pairs. The result is the geometric mean of the components'
+    unexplained fractions, which ranks offsets as the profile likelihood does if each component has
+    a separate noise variance. Therefore units do not matter, and a component that cannot be
     explained, such as the sideways motion of a robot with two wheels, does not hide the other
     components.
 
@@ -194,7 +194,7 @@ def clear_best(
 ) -> int | None:
     """Return the index of the best offset, or None if a distant offset is nearly as good.
 
-    `rest` is the unexplained share of the motion at each offset [1].
+    `rest` is the unexplained fraction of the motion at each offset [1].
     """
     best = int(np.argmin(rest))
     others = rest[np.abs(offsets - offsets[best]) > DISTANT_S]
@@ -245,7 +245,7 @@ class Linearised:
     Attributes:
         residual: weighted residuals.
         slope: derivatives of the residuals with respect to offset and drift, with B profiled out.
-        share: share of the motion that is unexplained [1].
+        share: unexplained fraction of the motion [1].
         noise: noise of each component, estimated from the residuals.
     """
 

@@ -2,10 +2,10 @@
 
 The columns of commanded or reported speeds may be in another order than those of the encoders; this
 can be found from a single run. The channels of commanded and of reported speeds may be exchanged: a
-command precedes the motion and is constant between its changes. If they are exchanged, the channel
-declared as the command changes later than the one declared as the measured speed, and in more rows.
-The sign and order of currents and voltages are found from the work of the motors, their units from
-the currents, voltages and power that are plausible for a robot.
+command precedes the motion and is constant between its changes. If the two channels are exchanged,
+the channel declared as the command changes later than the one declared as the measured speed, and
+in more rows. The sign and order of currents and voltages are found from the work of the motors,
+their units from the currents, voltages and power that are plausible for a robot.
 """
 
 from collections.abc import Iterator, Sequence
@@ -163,7 +163,7 @@ SHARE_OF_POWER = 0.1
 wheels turn forwards and below its negative while they turn backwards [1]."""
 MOST_A_PER_KG = 2.5
 """Slope of the largest plausible current of one motor, `MOST_A + MOST_A_PER_KG * mass` [A/kg];
-wheeled robots do not draw more continuously."""
+wheeled robots do not draw more for long."""
 MOST_A = 8.0
 """Constant part of the largest plausible current of one motor [A]."""
 MOST_A_WITHOUT_MASS = 200.0
@@ -171,7 +171,7 @@ MOST_A_WITHOUT_MASS = 200.0
 LEAST_A = 0.005
 """Current of a driving motor below which its unit must be wrong [A]."""
 MOST_V, LEAST_V = 200.0, 0.2
-"""Largest and smallest plausible voltages of the motors of such robots [V]."""
+"""Largest and smallest plausible voltages of a wheeled robot's motors [V]."""
 PLAUSIBLE_POWER = (0.003, 60.0)
 """Plausible range of the electrical power over weight times speed, P / (m g v) [1], for robots on
 any slope and surface."""
@@ -306,7 +306,7 @@ def _other_order(
 
 
 def _share(work: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "*any"]:
-    """Return the share of work: the sum over steps over the sum of magnitudes [1].
+    """Return the share of work: the sum over steps, divided by the sum of the magnitudes [1].
 
     It is 1 if all values are positive, -1 if all are negative, and 0 if all are zero.
     """

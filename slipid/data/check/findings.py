@@ -18,7 +18,7 @@ Severity = Literal["wrong", "suspicious", "note"]
 should be examined, `note` reports what could not be checked."""
 SEVERITIES: tuple[Severity, ...] = ("wrong", "suspicious", "note")
 MOST_NAMED_RUNS = 4
-"""Largest number of runs that a sentence names; the others are only counted."""
+"""Largest number of runs that a sentence names; further runs are only counted."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Finding:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return the first `MOST_NAMED_RUNS` names, and the number of the others."""
+    """Return a text with the first `MOST_NAMED_RUNS` names and the number of further names."""
     more = len(names) - MOST_NAMED_RUNS
     return ", ".join(names[:MOST_NAMED_RUNS]) + (f" and {more} more" if more > 0 else "")
 

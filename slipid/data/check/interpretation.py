@@ -1,9 +1,9 @@
 """Interpretations of the logs: order and signs of the wheels' columns, and the axes of the poses.
 
 The declared interpretation is compared with candidates, which differ from it by single mistakes.
-The misfit of an interpretation is a sum of unexplained shares, each from 0 to 1. The shares do not
-depend on the length of the motion, so that slip, which shortens it, does not count against the true
-interpretation:
+The misfit of an interpretation is a sum of unexplained fractions, each from 0 to 1. The fractions
+do not depend on the length of the motion, so that slip, which shortens it, does not count against
+the true interpretation:
 
     pose, and commanded twist   body increments along each axis that the wheels do not explain
     wheels                      rotations impossible for a rigid body (with more than three wheels)
@@ -81,7 +81,7 @@ class Commanded:
         return float(np.trace(turned))
 
     def unexplained(self, meant: Interpretation) -> float:
-        """Return the share of the turns that commanded turns, times one factor, do not explain."""
+        """Return the fraction of the turns that commanded turns, times a factor, do not explain."""
         squares = max(self.turns * self.commanded, 1e-300)
         return 1.0 - max(self.product(meant), 0.0) ** 2 / squares
 
@@ -161,7 +161,7 @@ def _commanded(moved: ChannelIncrements) -> Commanded | None:
 
 
 def misfits(evidence: Evidence, meant: Interpretation) -> dict[str, float]:
-    """Return the unexplained share of each compared channel, keyed by the name of the channel."""
+    """Return the unexplained fraction of each compared channel, keyed by the channel's name."""
     convention = meant.convention
     bare = convention.bare
     pose = evidence.pose.get(bare)
@@ -205,12 +205,12 @@ def _unexplained(
     axes: Float[np.ndarray, "3 3"],
     free: bool,
 ) -> float:
-    """Return the share of the body's motion that the prediction does not explain.
+    """Return the fraction of the body's motion that the prediction does not explain.
 
     The prediction has a fitted factor for each axis. Translation and rotation are weighted by the
-    mean of their shares in the prediction and in the poses, so that lengths in a wrong unit hide
-    neither of them. Wheels that do not determine the twist (`free` is False) determine only one
-    direction of translation, which has a single factor.
+    mean of their fractions of the motion in the prediction and in the poses, so that lengths in a
+    wrong unit hide neither of them. Wheels that do not determine the twist (`free` is False)
+    determine only one direction of translation, which has a single factor.
 
     Args:
         sums: products of turns and body increments.
@@ -237,7 +237,7 @@ def _unexplained(
 def _beyond_rigid(
     sums: Products, rolling: Float[np.ndarray, "wheel 3"], wheels: Float[np.ndarray, "wheel wheel"]
 ) -> float:
-    """Return the share of the wheels' rotation that is impossible for a rigid body without slip."""
+    """Return the fraction of wheel rotation that is impossible for a rigid body without slip."""
     basis, values, _ = np.linalg.svd(rolling, full_matrices=False)
     basis = basis[:, values > 1e-6 * values[0]]
     turns = wheels @ sums.turns @ wheels.T

@@ -153,7 +153,7 @@ def joined(data: Runs) -> JoinedRuns:
 
 
 def _rows(log: Log, name: str, columns: int) -> Float[np.ndarray, "row column"]:
-    """Return a channel of a run, or its integral; nan if the run does not have it."""
+    """Return a channel of a run, or the integral of a rate; nan if the run lacks the channel."""
     values = getattr(log, name)
     if values is None:
         return np.full((log.samples, columns), np.nan)
@@ -246,7 +246,8 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
     before[:, 2] = _heading(before[:, 2], convention.heading)
     turned = _heading(after[:, 2], convention.heading) - before[:, 2]
     # The reader removed the wrap-around of the heading in its declared unit. Under these
-    # conventions the heading wraps elsewhere, so the turn of each step is wrapped to half a turn.
+    # conventions the heading wraps elsewhere, so the turn of each step is wrapped into the range
+    # from -pi to pi.
     if convention.heading in ("radians", "half_sine"):
         turned = np.mod(turned + np.pi, 2 * np.pi) - np.pi
     after[:, 2] = before[:, 2] + turned

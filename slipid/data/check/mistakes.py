@@ -21,7 +21,7 @@ REDUCTION_SHARE = 0.3
 """Factor in the least reduction (see `LEAST_REDUCTION`) [1]; in real logs without a mistake the
 reductions stay far below the least reduction."""
 MOST_UNEXPLAINED = 0.4
-"""Largest share of the poses' motion that an accepted pose convention leaves unexplained [1]."""
+"""Largest fraction of the poses' motion that an accepted pose convention leaves unexplained [1]."""
 ALTERNATIVE_MARGIN = 0.02
 """Difference of misfits below which another kind of mistake is named as an alternative [1]."""
 GRID_DEG = 15
@@ -32,7 +32,7 @@ MOST_PERMUTED = 6
 
 @dataclass(frozen=True)
 class Candidate:
-    """A candidate interpretation, which corrects one mistake more than the current one.
+    """A candidate interpretation, which corrects one mistake of the current interpretation.
 
     Attributes:
         kind: name of the kind of mistake.

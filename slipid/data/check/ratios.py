@@ -38,9 +38,9 @@ from slipid.data.check.joined import (
 )
 
 LEAST_TURNING = 0.01
-"""Least share of rotation in the predicted motion for which rotations are compared [1]."""
+"""Least fraction of rotation in the predicted motion for which rotations are compared [1]."""
 LEAST_TRANSLATION = 0.02
-"""Least share of translation in the predicted motion for which translations are compared [1]."""
+"""Least fraction of translation in the predicted motion for which translations are compared [1]."""
 SAME_DATA = 1e-6
 """Relative difference between the wheels' angle and their integrated speed below which the angle
 was computed from the speed [1]."""
@@ -141,7 +141,7 @@ def _gyro(
 ) -> float | None:
     """Return the ratio of rotation by the gyro to that of the poses.
 
-    It is None if there is no gyro, or if their correlation is below 0.5.
+    It is None if there is no gyro, or if gyro and heading have a correlation below 0.5.
     """
     if moved.gyro is None:
         return None
@@ -160,7 +160,8 @@ def _gyro(
 def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
     """Return the ratio of reported to encoder wheel speeds, and whether they are the same data.
 
-    The ratio is None if no speeds were reported, no wheel turns, or they are the same data.
+    They are the same data if the wheel angle is the integral of the reported speed. The ratio is
+    None in this case, if no speeds were reported, or if no wheel turns.
     """
     if "wheel_speed" not in data.channels:
         return None, False

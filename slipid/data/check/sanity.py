@@ -56,7 +56,7 @@ from slipid.model.geometry import Geometry
 FEWEST_STEPS = 20
 """Least number of steps in which poses and wheels can be compared."""
 UNEXPLAINED_IF_FOREIGN = 0.4
-"""If the best interpretation leaves more than this share of the poses' motion unexplained, poses
+"""If the best interpretation leaves more than this fraction of the poses' motion unexplained, poses
 and wheels do not belong together [1]."""
 LATE_S = 1.0
 """Smallest magnitude of the lag of the poses that is a finding [s]."""
@@ -177,7 +177,7 @@ def _of_lag(lag: PoseLag) -> Iterator[Finding]:
 def _foreign(left: float) -> Finding:
     """Return the finding that poses and wheels do not belong together.
 
-    `left` is the share of the poses' motion that stays unexplained [1].
+    `left` is the fraction of the poses' motion that stays unexplained [1].
     """
     return Finding(
         "pose_unexplained",

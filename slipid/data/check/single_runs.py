@@ -32,7 +32,7 @@ LONGEST_RATIO = 4.0
 """Multiple of the median length of the body increments to which longer increments are
 shortened [1]."""
 SHARE_IF_ALL = 0.5
-"""If at least this share of the runs has constant poses, the finding is about all runs [1]."""
+"""If at least this fraction of the runs has constant poses, the finding is about all runs [1]."""
 
 
 @dataclass(frozen=True, eq=False)

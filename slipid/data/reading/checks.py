@@ -92,7 +92,7 @@ def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> 
 
 
 def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
-    """Raise `DataError` if a wheel turns impossibly fast, or stands still against its command."""
+    """Raise `DataError` if a wheel turns impossibly fast, or never turns although commanded to."""
     if not log.wheels:
         return
     rates = np.abs(np.diff(log.wheel_angle, axis=0)) / np.diff(log.time)[:, None]

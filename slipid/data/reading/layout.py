@@ -158,7 +158,7 @@ class Layout(SensorLayout):
     """Layout of one type of log file.
 
     Attributes:
-        channels: columns of each channel, by the name of the channel.
+        channels: columns of each channel, keyed by the name of the channel.
         delimiter: character between the cells of a CSV file; not used for Parquet.
         names_row: number of the line with the column names, counted from 1; 0 if there is none.
         units_row: number of the line with the units, which are checked against this layout; 0 if
@@ -173,8 +173,8 @@ class Layout(SensorLayout):
         clock: "own" if an additional file of poses was logged with another clock than that of the
             robot; the offset and drift of this clock are then estimated from the motion.
         beside: layouts of additional files in the same folder with more channels of the same run,
-            by the name of the file; `{stem}` in a name stands for the name of the run's main file
-            without its suffix.
+            keyed by the name of the file; `{stem}` in a name stands for the name of the run's main
+            file without its suffix.
     """
 
     channels: Mapping[str, Channel]

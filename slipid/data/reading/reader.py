@@ -100,9 +100,9 @@ def read_logs(
     """Return every run in a CSV or Parquet file or in a bag.
 
     A run is left out if its pose jumps, because the marker was confused with another one or the
-    matching of scans failed, or if its poses have a clock that the motion does not determine. Runs
-    in a file of rows are separated by `layout.new_run`, those in a bag by `layout.runs`. Parts of a
-    file with a single row show no motion and are dropped.
+    matching of scans failed, or if its poses have a clock of their own whose offset the motion does
+    not determine. Runs in a file of rows are separated by `layout.new_run`, those in a bag by
+    `layout.runs`. Parts of a file with a single row show no motion and are dropped.
 
     Args:
         path: the file.

@@ -170,7 +170,7 @@ def text_lines(path: Path, raw: bytes) -> list[str]:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         row = raw.count(b"\n", 0, error.start) + 1
-        found = f"byte 0x{raw[error.start]:02x}, which is no UTF-8"
+        found = f"byte 0x{raw[error.start]:02x}, which is not UTF-8"
         raise bad_data(
             path, found, "UTF-8 text (is the file binary or Latin-1?)", row=row
         ) from error

@@ -49,7 +49,8 @@ def _worst(fit: MotorFit, equation: Equation) -> str | None:
         ("current", w.current, "A"),
         ("time", (w.time, w.time), "s"),
     ):
-        # residuals of even rows are binned by odd rows and vice versa: their noise is independent
+        # A residual's own noise must not choose its bin: residuals of even rows are binned by odd
+        # rows, and vice versa.
         bins = [np.array_split(used[np.argsort(v[used], kind="stable")], BINS) for v in (odd, even)]
         for some in zip(*bins, strict=True):
             off, sure = _mean(fit, equation, *some)

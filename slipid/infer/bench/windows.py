@@ -6,9 +6,9 @@ lines between rows both are sums over the rows l of the window, whatever the ker
 
     <x> = sum_l c_l (t_l+1 - t_l) (x_l + x_l+1) / 2        [x] = sum_l c_l (x_l+1 - x_l)
 
-One sum goes over the even rows of a window, another over the odd ones. Their sensor noises are
-independent, so that the residual of one can be multiplied by the signals of the other without bias
-(`slipid.infer.bench.moments`).
+One sum goes over the even rows of a window, another over the odd rows. The sensor noises of both
+sums are independent, so that the residual from even rows can be multiplied by the signals from odd
+rows without bias, and vice versa (`slipid.infer.bench.moments`).
 
 Windows with a gap in time are omitted, and so are windows with a jump of the voltage inside or
 shortly before: the time of the jump between two rows is unknown, and the current is not a straight
@@ -166,7 +166,7 @@ class _RecordWindows:
         return np.stack([(c * np.diff(signal[rows], axis=1)).sum(axis=1) for c, rows in parts])
 
     def long_mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
-        """Return the mean over longer windows of the same rows, whose sign is more reliable."""
+        """Return means over longer windows around the same rows, for more reliable signs."""
         last = len(signal) - 1
         wide = [
             np.clip(self._rows(LONG_WINDOW_RATIO * self.half, first), first, last)

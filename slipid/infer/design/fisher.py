@@ -65,7 +65,7 @@ class Information:
 
     def plus(self, rows: RunJacobians, times: float = 1.0) -> "Information":
         """Return the information after adding these runs `times` times; -1 removes the runs."""
-        # reshape(-1, ...) would fail for arrays without columns
+        # The number of rows is given, as reshape(-1, ...) would fail for arrays without columns.
         j, e, c = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in rows)
         return Information(
             self.is_electric,

@@ -74,8 +74,8 @@ def candidates(
 
     Args:
         setups: floors and load set-ups.
-        speeds: speeds by floor [m/s].
-        distance: path length by floor [m].
+        speeds: speeds, keyed by floor [m/s].
+        distance: path length, keyed by floor [m].
         base_radius: distance of the wheels from the robot's centre [m].
         headings_deg: directions of travel [deg].
         turns: yaw rates [rad/s]. By default, runs with a speed have zero and plus or minus

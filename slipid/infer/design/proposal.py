@@ -32,7 +32,7 @@ ASSUMPTIONS = (
     "length",
     "effects shared by runs in similar directions are treated as independent effects of each run",
     "all new runs belong to one session, so its offset does not average out",
-    "the model is linear around the fitted numbers, and fixed numbers stay fixed",
+    "the model is linear around the fitted parameters, and fixed parameters stay fixed",
     "wheel speeds are steady: starting and stopping add no information",
     "runs start with the marker's heading at zero and are centred in the image",
     "the marker is mounted again for the new runs; predictions assume its mean position",
@@ -48,7 +48,7 @@ class Design:
             many runs are saved compared with grids.
         runs: the proposed runs.
         base_radius: distance of the wheels from the robot's centre [m].
-        validity: ranges that the runs of the fit cover, by floor.
+        validity: ranges that the runs of the fit cover, keyed by floor.
         reachable: True if candidate runs can reduce the std of every requested goal.
     """
 

@@ -39,9 +39,9 @@ class Scope:
         parameters: patterns of parameter names; every matching parameter is a goal.
         predictions: predictions that are goals, as `floor[@load][:speed[:heading_deg]]`.
         runs: number of runs to propose.
-        headings: headings of candidates, numbers with commas [deg].
-        speeds: speeds of candidates, numbers with commas [m/s].
-        turns: yaw rates of candidates, numbers with commas [deg/s].
+        headings: headings of candidates, separated by commas [deg].
+        speeds: speeds of candidates, separated by commas [m/s].
+        turns: yaw rates of candidates, separated by commas [deg/s].
         length: path length of candidates [m].
         floors: floors of candidates.
         loads: load set-ups of candidates.

@@ -1,6 +1,6 @@
 """Transport map: coordinates in which a posterior is nearly a standard Gaussian, learnt from draws.
 
-It is a triangular map (Knothe-Rosenblatt) from coordinates x to u, through v:
+The map is triangular (Knothe-Rosenblatt) and leads from coordinates x to u, through v:
 
     shared coordinates      v = L^-1 (x - m)
     coordinates of a group  w = L^-1 (x - m - B s), those with the largest variance first

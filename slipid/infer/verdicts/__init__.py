@@ -1,1 +1,1 @@
-"""Verdicts on fits: identified numbers, flat directions, disputed loads, and trust in a fit."""
+"""Verdicts on fits: identified parameters, flat directions, disputed loads, trust in a fit."""

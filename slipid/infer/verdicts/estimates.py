@@ -25,9 +25,9 @@ interval."""
 AT_ZERO_STDS, AT_ZERO_RATIO = 4.0, 0.05
 """Limits at which a positive parameter counts as being at its bound 0.
 
-It must be more than `AT_ZERO_STDS` prior stds below its prior mean and less than `AT_ZERO_RATIO`
-times that mean. The second condition excludes parameters with a narrow prior that the data
-contradict.
+The parameter must be more than `AT_ZERO_STDS` prior stds below its prior mean and less than
+`AT_ZERO_RATIO` times that mean. The second condition excludes parameters with a narrow prior that
+the data contradict.
 """
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Parameters that are not identified without voltages.

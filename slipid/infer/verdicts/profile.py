@@ -58,8 +58,8 @@ class Profile:
         estimate: value of the fit [unit].
         interval90: 90 % interval of the likelihood, None for the end of an open side [unit].
         ends: kind of each side: `closed`, `open` (the likelihood does not fall to the level of the
-            interval's end within the computed range) or `at_bound` (the same, but the parameter's
-            bound ends the interval).
+            interval's end within the computed range) or `at_bound` (open, but the parameter's bound
+            ends the interval).
         given: what was held at the fit's values, as text; empty if all parameters were refitted.
         settled: True if every refit converged.
         sentence: result in one sentence for people.

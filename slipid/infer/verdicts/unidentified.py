@@ -239,8 +239,8 @@ def _rounded(
     """Return the search-space step along a direction, of length 1 in prior stds, rounded.
 
     The steps of the coordinates in `main` are rounded to multiples of half the largest one, which
-    makes the exponents of a formula simple. They stay as they are if rounding would make one of
-    them zero, or the direction no longer flat.
+    makes the exponents of a formula simple. The steps stay unrounded if rounding would make one of
+    them zero, or if the rounded direction is not flat.
     """
     step = u * std
     top = float(np.abs(step[main]).max())

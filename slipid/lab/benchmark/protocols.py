@@ -1,4 +1,4 @@
-"""Protocols of the benchmark: held-out runs, and what methods are told about floors."""
+"""Protocols of the benchmark: which runs are held out, and which floors methods are given."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -128,7 +128,7 @@ KINDS: dict[str, Callable[[Sequence[FoldKey]], Labels]] = {
 
 
 def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
-    """Return the folds of a kind, without those that have too few training or held-out runs.
+    """Return the folds of a kind of split, omitting folds with too few training or held-out runs.
 
     Runs whose fold is -1 are training runs in all folds. A run on a floor without training runs is
     not held out, unless the split is by floors.

@@ -93,5 +93,5 @@ class RectangleTask:
         try:
             options = trial.TrialOptions(plant, controllers=tuple(controllers), starts=STARTS)
             return trial.trial(self.folder, options, executor, report).content
-        except Exception as error:  # A failed trial does not stop the rest of the benchmark.
+        except Exception as error:  # the benchmark goes on if the trial fails
             return {"failed": FoldScore.of_error(error).absent}

@@ -31,7 +31,7 @@ PAGE_ONLY = ("length_error", "twist_error")
 
 
 def show_benchmark(page: Page, found: Content) -> None:
-    """Write every table, best rows first, and their summary in sentences."""
+    """Print every table, best rows first, and the sentences that summarise the tables."""
     for name, one in found["sets"].items():
         for protocol, rows in one["protocols"].items():
             about = found["protocols"][protocol]
@@ -184,7 +184,7 @@ def classifiers(found: Content) -> ExtraTable:
 
 
 def settings_lines(rows: Content) -> list[str]:
-    """Return a line for each row with settings: those selected by cross-validation in each fold."""
+    """Return a line for each row with settings, which cross-validation selected in each fold."""
     return [
         f"{name}: {'; '.join(dict.fromkeys(row['settings']))}"
         for name, row in rows.items()

@@ -38,8 +38,8 @@ TOLERANCE = 0.1
 
 The errors of predictions vary far more than this between runs."""
 STEPS_MULTIPLE = 16
-"""The steps of a replay are padded to a multiple of this number, so that few shapes are compiled.
-"""
+"""The steps of a replay are padded to a multiple of this number, so that the estimator is compiled
+for few array sizes."""
 RUNS_PER_CALL = 32
 """Number of runs in one call of an estimator. Smaller numbers are padded, so that the estimator is
 compiled for a single array size."""

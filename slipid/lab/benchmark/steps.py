@@ -42,7 +42,7 @@ def run_batches(data: Runs, robot: Robot, poses_per_step: int = POSES_PER_STEP) 
     """Return all runs divided into steps, from one centimetre of wheel motion to the last pose.
 
     Logged poses are corrected in scale and lag by the robot's camera model. Nearly all runs get the
-    same number of steps, a power of two, so that few shapes are compiled.
+    same number of steps, a power of two, so that functions are compiled for few array sizes.
     """
     poses = [int(data.fresh[data.rows(k)].sum()) for k in range(len(data))]
     usual = _step_count(float(np.quantile(poses, 0.1)), poses_per_step)
@@ -102,7 +102,7 @@ def _mean(
 def body_poses(
     robot: Robot, w: Windows, marker: Float[np.ndarray, "segment edge 3"]
 ) -> Float[np.ndarray, "segment edge 3"]:
-    """Return poses of the body from those of its marker, both in true metres and radians."""
+    """Return the poses of the body, given the poses of its marker, both in true metres."""
     yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
     out = marker.copy()
     out[..., 2] -= np.array([yaws[s] for s in w.session])[:, None]

@@ -131,7 +131,7 @@ class Bootstrap:
 
 
 def mean_interval(draws: Float[np.ndarray, " draw"]) -> MeanInterval:
-    """Return the first draw (that of the original runs), with the 90 % interval of the others."""
+    """Return the first draw (the original runs), with the 90 % interval of all later draws."""
     low, high = np.nanquantile(draws[1:], INTERVAL)
     return MeanInterval(float(draws[0]), float(low), float(high))
 
@@ -142,7 +142,7 @@ def _summary(
     rival: Sequence[RunScore] | None,
     by: Bootstrap,
 ) -> RowSummary:
-    """Return the row of a method; `rival` has the scores that it is compared with, if any."""
+    """Return the row of a method, compared with the scores `rival` if there are any."""
     runs, ended = score.runs, folds if score.runs else ()
 
     def mean(name: str) -> MeanInterval | None:
@@ -211,7 +211,7 @@ def area(
 
 
 def reading(tables: Mapping[str, Mapping[str, Mapping[str, RowSummary]]]) -> list[str]:
-    """Return a sentence for each protocol of each data set that compares slipid with the rest."""
+    """Return a sentence per protocol and data set that compares slipid with the other rows."""
     return [
         sentence(name, protocol, found)
         for name, protocols in tables.items()

@@ -110,14 +110,14 @@ def source_of(name: str) -> LogSource:
 
 @lru_cache(maxsize=8)
 def data_of(options: BenchmarkOptions, source: str) -> DataSet:
-    """Return the data set of a source; it is read once in every process."""
+    """Return the data set of a source; each process reads it once."""
     found = read_set(source_of(source), options.data, options.out, Reporter(quiet=True))
     return found.thinned(QUICK_RUNS) if options.quick else found
 
 
 @lru_cache(maxsize=8)
 def problem_of(options: BenchmarkOptions, source: str) -> Problem:
-    """Return slipid's fitting problem of all runs of a source; it is made once in every process."""
+    """Return slipid's fitting problem of all runs of a source; each process makes it once."""
     return data_of(options, source).job.problem()
 
 
@@ -172,7 +172,7 @@ class FoldData:
 
     @property
     def runs(self) -> list[Run]:
-        """The held-out runs."""
+        """Held-out runs of all batches."""
         return [run for batch in self.batches for run in batch.runs]
 
 
@@ -220,7 +220,7 @@ def _with_facts(batch: RunBatch, data: DataSet, numbers: np.ndarray) -> RunBatch
 
 
 def _score(data: FoldData, protocol: str, name: str) -> FoldScore[RunScore]:
-    """Return the score of a row in a protocol, or the reason why it is absent."""
+    """Return the score of a row in a protocol; an empty score gives the reason for its absence."""
     rules = PROTOCOLS[protocol]
     runs = [run.with_floor(rules.floor_known) for run in data.runs]
     try:

@@ -177,7 +177,7 @@ class PaperSvr(WheelSlip):
 
 
 def refits() -> list[CurveModel]:
-    """Return curves of the printed and the deployed form before their fit, clipped to [-1, 1]."""
+    """Return unfitted curves of the printed and of the deployed form, clipped to [-1, 1]."""
     deployed = above(tables.DEPLOYED_THRESHOLD)
     return [
         CurveModel("paper_print_refit", powers(0, 1, 2), RunSignals.torque, most=1.0, needs=NEEDS),
@@ -193,6 +193,6 @@ def refits() -> list[CurveModel]:
 
 
 def paper_rows() -> list[SlipModel]:
-    """Return the models of the paper's rows before their fit."""
+    """Return the unfitted models of the paper's rows in the benchmark."""
     svr = PaperSvr("paper_linear_svr", 1), PaperSvr("paper_quadratic_svr", 2)
     return [PaperPrint(), PaperCode(), *refits(), *svr]

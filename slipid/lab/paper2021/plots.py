@@ -1,4 +1,4 @@
-"""Reproduction of the 2021 paper: its numbers as JSON, and its figures 2, 3, 4 and 7."""
+"""Reproduction of the 2021 paper: its results as JSON, and its figures 2, 3, 4 and 7."""
 
 from pathlib import Path
 

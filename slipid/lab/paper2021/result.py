@@ -87,7 +87,7 @@ class SquareTrack:
         return float(np.hypot(*(self.position[-1] - self.position[0])))
 
     def as_dict(self) -> dict[str, float | str | int]:
-        """Return the numbers of the track; their names end in their units."""
+        """Return the lengths and headings of the track, keyed by names that end in the unit."""
         return {
             "label": self.file.label,
             "side_frames": self.file.side_frames,

@@ -218,7 +218,7 @@ def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
 
 
 def leave_one_surface_out(logs: Iterable[Log]) -> Content:
-    """Return the errors of slip on each surface, by curves fitted to the others or to itself.
+    """Return, for each surface, the slip errors of curves fitted to other surfaces or to itself.
 
     Poses are used as the camera logged them, without correction of its scale and lag.
 

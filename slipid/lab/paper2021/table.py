@@ -100,7 +100,7 @@ class MotorTable:
 
 
 def fit_form(samples: SlipSamples, name: str) -> FittedForm:
-    """Return the least-squares fit of the named form to the samples.
+    """Return the least-squares fit of a form to the samples; `name` is a key of `_FORMS`.
 
     Raises:
         ValueError: there are fewer samples than coefficients.

@@ -334,7 +334,7 @@ class _LogSimulator:
         noise = s.voltage_noise * rng.normal(size=true.shape)
         held = np.asarray(motor.voltage(jnp.asarray(true), jnp.asarray(w))) + noise
         voltage = np.round(held / s.voltage_step) * s.voltage_step if s.has_voltage else None
-        # A Robotino reports wheel speeds in these steps, and 1.3 % too high.
+        # report wheel speeds as a Robotino does: in steps of `quantum`, and 1.3 % too high
         quantum = 2.83 / self.robot.geometry.gear_ratio
         return current * s.current_step, voltage, np.round(1.013 * w / quantum) * quantum
 

@@ -232,7 +232,7 @@ def plausible(task: ConfigFitTask, problem: Problem) -> tuple[np.ndarray, np.nda
 def replicates(
     task: ConfigFitTask, problem: Problem, count: int, seed: int, kept: Checkpoint, report: Reporter
 ) -> list[Replicate]:
-    """Return `count` replicates; those in the checkpoint are not simulated again.
+    """Return `count` replicates; replicates in the checkpoint are not simulated again.
 
     Args:
         task: fit task of the experiment.

@@ -205,7 +205,7 @@ def _naming(what: str) -> Iterator[None]:
 def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
     """Return the text of a config with which `slipid identify` fits the logs in slipid's format.
 
-    With `by_video`, poses are those tracked in the videos instead of those in the logs.
+    With `by_video`, the config reads poses tracked in the videos instead of poses in the logs.
     """
     robot, sensors = plan.site.robot, plan.site.sensors
     measured = 0.0015 * float(np.random.default_rng([plan.content.seed, 2]).normal())
@@ -242,7 +242,7 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
 
 
 def _map_sets(plan: SimulationPlan) -> list[tuple[str, str]]:
-    """Return the pairs (load set-up, map) of those runs on maps that a fit can use.
+    """Return the pairs (load set-up, map) of the runs across several surfaces that a fit can use.
 
     A fit can use a run on a map if every surface of the map, and the load set-up of the run, also
     occur in runs on a single surface. Poses of runs on maps are logged in the frame of the map,

@@ -104,7 +104,7 @@ class Studio:
     def frame(self, pose: Pose, wheel_angle: Angles) -> np.ndarray:
         """Return an image of the robot with lens distortion, without blur and noise.
 
-        Its shape is (row, column, 3), with blue, green and red.
+        The array has shape (row, column, 3), with blue, green and red.
         """
         q = self.data.qpos
         q[:2], q[3], q[6] = pose[:2], np.cos(0.5 * pose[2]), np.sin(0.5 * pose[2])
@@ -183,8 +183,8 @@ def film(
         written = cv2.VideoCapture(str(unfinished)).get(cv2.CAP_PROP_FRAME_COUNT)
         if written != len(frames):
             raise DataError(
-                f"{path}: only {written:.0f} of {len(frames)} frames were written; is the disk "
-                "full?"
+                f"{path}: only {written:.0f} of {len(frames)} frames were written; expected "
+                "enough space on the disk"
             )
         os.replace(unfinished, path)
     finally:

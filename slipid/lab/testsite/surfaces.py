@@ -19,7 +19,7 @@ LEVELS = 7
 ARENA_HALF = 1.6
 """Half the edge length of the square floor around the start if there is a single surface [m]."""
 GRID_CELL = 0.005
-"""Cell size of the floor's lookup grid, which is larger on very large floors [m]."""
+"""Cell size of the floor's lookup grid [m]; on very large floors the cells are larger."""
 
 Pose = tuple[float, float, float]
 """Pose of the robot: x, y [m], heading [rad]."""
@@ -128,7 +128,8 @@ def _random_levels(
 def arena(floor: FloorMap, start: Pose) -> tuple[float, float, float, float]:
     """Return lowest x, lowest y, highest x, highest y of the floor around a start [m].
 
-    It is the whole map, or for a single surface a square around the start.
+    For a map with several surfaces this is the whole map, for a single surface a square around the
+    start.
     """
     if len(floor.surfaces) > 1:
         return floor.extent

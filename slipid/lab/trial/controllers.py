@@ -69,7 +69,7 @@ ROWS: Mapping[str, ControllerRow] = {
         "encoder", "law of Indiveri, whose speed limit keeps the direction", law=_indiveri
     ),
 }
-"""Controllers by name: those of slipid and of the 2021 paper, then the published laws."""
+"""Controllers keyed by name: slipid's and the 2021 paper's, then the published control laws."""
 
 
 def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
@@ -89,7 +89,7 @@ def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
 
 
 def check_gains(out: Path, robot: DeployedRobot) -> None:
-    """Raise `DataError` if the robot's file, in `out`, has no tuned gains for its load set-up."""
+    """Raise `DataError` if robot.json in `out` has no tuned gains for the robot's load set-up."""
     tuned, path = robot.record.gains, out / "robot.json"
     if tuned is None:
         raise DataError(f"{path}: the robot has no tuned gains; omit --tuned-gains")

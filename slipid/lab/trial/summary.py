@@ -95,7 +95,7 @@ def _by_controller(runs: Sequence[TrialRun]) -> dict[str, list[TrialRun]]:
 
 
 def _resampled(of: Mapping[str, Sequence[TrialRun]]) -> Int[np.ndarray, "draw start"]:
-    """Return indices of starts, drawn with replacement from those that all controllers drove."""
+    """Return start indices, drawn with replacement from the starts that all controllers drove."""
     count = min(map(len, of.values()))
     return np.random.default_rng(0).integers(count, size=(DRAWS, count))
 

@@ -135,7 +135,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     Raises:
         DataError: there is no fit in the folder; the plant, a controller, the path, the load set-up
             or a map does not exist; MuJoCo is missing; a floor is unknown to the plant or the fit;
-            or the speed is higher than those of the fitted runs.
+            or the speed is higher than that of any fitted run.
     """
     setup_jax(quiet=True)
     tasks = _tasks(out, options)

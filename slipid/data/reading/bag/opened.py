@@ -142,7 +142,7 @@ def _source(reader: "Reader") -> Callable[..., Iterator[Any]]:
 
 @contextmanager
 def open_bag(path: Path, definitions: Path | None) -> Iterator[OpenBag]:
-    """Return a context manager that opens a bag for reading, and closes it at its end.
+    """Return a context manager that opens a bag for reading, and closes it on exit.
 
     Args:
         path: a .bag, .db3 or .mcap file, the folder of a rosbag2, or the metadata.yaml in it.
@@ -217,7 +217,7 @@ def damage_error(files: BagFiles, error: Exception) -> DataError:
     text = (str(error).splitlines() or [type(error).__name__])[0][:200]
     file = files.parts[0]
     if "not indexed" in text:
-        expected = f"a whole bag; {_REMEDY['rosbag1'].format(file=file)}"
+        expected = f"a complete bag; {_REMEDY['rosbag1'].format(file=file)}"
         return bad_data(files.path, "the bag has no index: its recording was cut off", expected)
     if isinstance(error, PermissionError):
         return bad_data(files.path, f"cannot be read ({error.strerror})", OPENABLE)
@@ -234,4 +234,4 @@ def damage_error(files: BagFiles, error: Exception) -> DataError:
     if "metadata" in text.lower() or "files are missing" in text:
         remedy = _METADATA.format(file=files.path)
     found = f"the bag is damaged or was cut off ({text})"
-    return bad_data(files.path, found, f"a whole one; {remedy}")
+    return bad_data(files.path, found, f"a complete bag; {remedy}")

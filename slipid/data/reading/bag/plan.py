@@ -22,7 +22,7 @@ _JOINT_ARRAYS = {"position": "rad", "velocity": "rad/s", "effort": None}
 _KNOWN: dict[str, dict[str, tuple[str, str]]] = {
     "sensor_msgs/msg/Imu": {"gyro": ("angular_velocity.z", "rad/s")},
     "sensor_msgs/msg/BatteryState": {"bus_voltage": ("voltage", "V"), "current": ("current", "A")},
-    # These types are in the packages robotino_msgs and rto_msgs.
+    # Both packages robotino_msgs and rto_msgs have these types, so their names have no package.
     "MotorReadings": {
         "motor_speed": ("velocities", "rpm"),
         "wheel_ticks": ("positions", "tick"),
@@ -288,5 +288,5 @@ def _check_unit(channel: str, path: str, unit: str, topic: BagTopic) -> None:
 
 
 def _listed(message: MessageType) -> str:
-    """Return the paths of the numbers in a type, for error messages."""
+    """Return the paths of the numbers in a message type, for error messages."""
     return first_names(path for path, what in message.paths.items() if not what.startswith("text"))

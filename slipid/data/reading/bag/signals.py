@@ -1,6 +1,7 @@
 """Signals of channels, poses and twists from the numbers in the messages of topics.
 
-The rows are sorted by time on the clock that the layout selects; repeated times are left out.
+The rows are sorted by time on the clock that the layout selects; of rows with the same time, only
+the last is kept.
 """
 
 from collections.abc import Sequence
@@ -121,7 +122,7 @@ def whole_signal(stream: Stream, notes: list[str]) -> Signal:
 def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) -> Signal:
     """Return a signal whose columns come from different messages.
 
-    They come from several topics, or from messages that have only some of the columns. The signal
+    The columns are in several topics, or in messages that have only some of the columns. The signal
     has the times of the first column, to which the other columns are interpolated linearly; times
     outside the record of some column are left out.
 
@@ -136,7 +137,8 @@ def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) 
     """
     pairs = [(stream, j) for stream in streams for j in range(len(stream.columns))]
     if by_name:
-        # Every stream has a column for every joint, but most of its columns are empty.
+        # Every stream has a column for every joint, but most of its columns are empty: each joint
+        # is taken from the first stream with numbers for it.
         having = [(stream, j) for stream, j in pairs if not stream.absent[:, j].all()]
         owner = {j: stream for stream, j in reversed(having)}
         pairs = [(owner[j], j) for j in sorted(owner)]
@@ -170,7 +172,7 @@ def mostly_whole(stream: Stream) -> bool:
 def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
     """Return the rows with finite numbers.
 
-    Rows with NaN are left out, with a note, if the layout says so (`drop_nan`).
+    Rows with NaN are left out, with a note, if the layout sets `drop_nan`.
 
     Raises:
         DataError: there are other numbers that are not finite, or no row is left.

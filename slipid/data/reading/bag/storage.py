@@ -159,7 +159,8 @@ def repaired(path: Path) -> RepairedMcap | None:
             if len(head) < 9:
                 break
             kind, length = struct.unpack("<BQ", head)
-            # After the end of the data there are no more messages.
+            # Reading stops at the end of the data, after which there are no messages, at a zero
+            # byte, and at a record that was cut off.
             if kind == _DATA_END or kind == 0 or end + 9 + length > size:
                 break
             end, records = file.seek(end + 9 + length), records + 1

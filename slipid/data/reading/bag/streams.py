@@ -102,7 +102,7 @@ class FieldPick:
         self.columns = self.paths
 
     def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """Return the places of the numbers of each row in a message of a shape."""
+        """Return the byte offsets of each row's numbers in messages with a byte layout."""
         each = {path: shape.places(path) for path in self.paths}
         numbers = [place for places in each.values() for place in places]
         if not numbers:
@@ -130,7 +130,7 @@ class JointPick:
     names: dict[str, None] = field(default_factory=dict)
 
     def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """Return the places of the numbers of each row in a message of a shape."""
+        """Return the byte offsets of each row's numbers in messages with a byte layout."""
         names, places = shape.texts("name"), shape.places(self.array)
         self.names.update(dict.fromkeys(names))
         # An array with another length than the names, such as an empty one, cannot be assigned to
@@ -151,7 +151,7 @@ class TransformPick:
     columns: tuple[str, ...] = (*POSITION, *ROTATION)
 
     def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """Return the places of the numbers of each row in a message of a shape."""
+        """Return the byte offsets of each row's numbers in messages with a byte layout."""
         rows = []
         for k, edge in enumerate(edges_of(shape)):
             if edge == self.edge:

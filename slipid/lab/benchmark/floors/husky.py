@@ -58,7 +58,7 @@ FEWEST_ROWS = 3
 
 
 def husky() -> Robot:
-    """Return the Husky with its maker's data and measured motor friction, without floors."""
+    """Return the Husky without floors, from its maker's data and measured motor friction."""
     robot = build(skid_steer(0.256, 0.275, RADIUS, 78.71, drive_of=(0, 1, 0, 1)), ())
     gain = float(robot.motor.gain)
     motor = replace(

@@ -38,7 +38,7 @@ ABOUT = "Robotino on four floors, straight runs: wheel speeds and magnitudes of 
 
 
 def robotino_classifiers() -> list[FloorClassifier]:
-    """Return the classifiers other than slipid, without those that need an accelerometer."""
+    """Return the classifiers other than slipid that need no accelerometer."""
     trees = [row for row in tree_classifiers() if "vibration" not in row.channels]
     return [CosineEnergyClassifier(), GaussianClassifier(), *trees]
 

@@ -81,7 +81,7 @@ def deployed(robot: Robot) -> DeployedRobot:
 
 
 BEND_RATIOS = (0.17, 0.45)
-"""Smallest ratio L |W| / (|v| + L |W|) that counts as a bend, and as turning on the spot.
+"""Smallest ratios L |W| / (|v| + L |W|) at which motion counts as a bend and as a turn on the spot.
 
 v is the velocity [m/s], W the yaw rate [rad/s] of the rolling wheels, and L the base radius [m].
 """
@@ -89,8 +89,8 @@ RUNS_PER_CALL = 64
 """Number of runs in one call of the filter. Smaller numbers are padded, so that the filter is
 compiled for a single array size."""
 SHARED_ROWS = 20.0
-"""Weight [rows] of the mean squared residual over all motion on a floor, when it is combined with
-the squared residuals of one kind of motion there. It acts as a prior for kinds with few rows.
+"""Weight [rows] of the mean squared residual over all motion on a floor, which is added to the
+squared residuals of each kind of motion there, as a prior for kinds of motion with few rows.
 """
 MOST_ROWS = 150
 """Approximate number of rows per run from which the scatter of currents is computed; longer runs
@@ -167,7 +167,7 @@ class SlipidFloorClassifier(FloorClassifier):
         return 3 * len(self.labels) + self.std.size + self.fitted.geometry.drives
 
     def _on(self, labels: tuple[str, ...]) -> Robot:
-        """Return the robot on the named floors with parameters that are not yet fitted."""
+        """Return the robot on the floors `labels`, whose parameters are not yet fitted."""
         if self.robot is None:
             raise ValueError(f"{self.name}: no robot was given; expected the argument `robot`")
         robot = self.robot.on(labels)

@@ -211,8 +211,8 @@ def yaw_rate_shortfall(
 ) -> Float[np.ndarray, " row"]:
     """Return the shortfall of the body's yaw rate below that of the rolling wheels [rad/s].
 
-    It is the difference of the yaw rates from encoders and gyro, positive where the body turns
-    less, for either sense of rotation.
+    The shortfall is the difference of the yaw rates from encoders and gyro, with a sign that makes
+    it positive where the body turns less than its wheels do, to the left or to the right.
     """
     return np.asarray(np.where(rolling < 0, gyro - rolling, rolling - gyro))
 

@@ -72,7 +72,7 @@ class ProcessRows:
     weight: Float[np.ndarray, " row"]
 
     def only(self, take: Bool[np.ndarray, " row"] | Int[np.ndarray, " some"]) -> "ProcessRows":
-        """Return the rows where `take` is True, or those of the indices in `take`."""
+        """Return the rows that `take` selects: by True values, or by indices."""
         return ProcessRows(self.x[take], self.y[take], self.weight[take])
 
     def drawn(self, most: int) -> "ProcessRows":

@@ -92,7 +92,7 @@ class NetworkSet:
         in_a: Bool[np.ndarray, " window"],
         growth: Growth,
     ) -> "NetworkSet":
-        """Return networks fitted to the windows of half A and selected on those of half B."""
+        """Return networks fitted to windows of half A and selected by their errors in half B."""
         inputs, outputs = Scale.of(x), Scale.of(y)
         scaled = inputs.scaled(x)
         each = [grown(scaled, column, weight, in_a, growth) for column in outputs.scaled(y).T]
@@ -224,7 +224,7 @@ class GmdhClass(SlipModel):
 
 
 def first_half(run: Int[np.ndarray, " window"], floors: np.ndarray) -> Bool[np.ndarray, " window"]:
-    """Return True for the windows of half A: those of half of each floor's runs, at random.
+    """Return True for the windows of half A, which has a random half of the runs on each floor.
 
     On a floor with only one run, half A has every other window. `floors` names the floor of each
     window.

@@ -15,8 +15,8 @@ to a floor, are shared by all wheels, and are fitted in one of three ways:
 
 The hard floor is the training floor on which encoders have the smallest errors. The threshold for
 slip comes from the currents on the hard floor and is used on all floors. If all training runs are
-on one floor, the quarter of the runs with the smallest encoder errors takes the place of a hard
-floor; little slip is flagged then.
+on one floor, the quarter of the runs with the smallest encoder errors replaces the hard floor;
+little slip is flagged then.
 
 The method handles floors itself: it has k0 and k1 for each training floor, and a pair fitted to all
 runs for runs whose floor is not given or was not trained. Tuned: the low pass's time constant.

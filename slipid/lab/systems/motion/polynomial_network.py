@@ -66,7 +66,7 @@ class Layer:
         return np.asarray(sum(w * term for w, term in zip(self.weight.T, terms, strict=True)))
 
     def only(self, neurons: Int[np.ndarray, " some"]) -> "Layer":
-        """Return a layer with only the neurons of these indices."""
+        """Return a layer with only the neurons whose indices are given."""
         return Layer(self.inputs[neurons], self.weight[neurons])
 
 
@@ -107,7 +107,8 @@ def grown(
         x: at least two inputs, each of about mean zero and variance one.
         y: target of about mean zero and variance one.
         weight: weight of each row in all means.
-        in_a: rows of half A; the others are half B. If either is empty, all rows are in both.
+        in_a: True for rows of half A, False for rows of half B. If a half is empty, both halves
+            have all rows.
         growth: settings of the growth.
     """
     layers: list[Layer] = []

@@ -25,7 +25,7 @@ Liberties:
   1 - s where slip is flagged; s is the mean slip of flagged training windows by least squares.
 - Thresholds are quantiles over training steps without slip (for I_lo the median); if all windows
   slip, they are the smallest value of the signal.
-- Where there is no gyro, EI >= 1 takes the place of GI >= 1.
+- Without a gyro, EI >= 1 replaces GI >= 1.
 - The original compares the wheels of a rover with each other. An omni robot's wheels turn at
   different speeds, so their speeds are compared with those in proportion to the commanded twist.
   The deviation of a slow wheel is divided by 0.3 of the fastest reference instead of its own. The

@@ -143,7 +143,7 @@ class Dynamics:
         slope[:, range(3), range(3)] -= linear
         rate = (traction @ self.rims - linear * q) * _OVER_MASS
         slope *= _OVER_MASS[:, None]
-        # the term W (vy, -vx), since the axes of q turn with the body
+        # add the term W (vy, -vx), since the axes of q turn with the body
         yaw = q[:, 2] / self.base_radius
         rate[:, 0] += yaw * q[:, 1]
         rate[:, 1] -= yaw * q[:, 0]
@@ -242,7 +242,8 @@ def measurements(run: RunSignals, spec: RobotSpec) -> tuple[np.ndarray, ...]:
 def motor_forces(run: RunSignals, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
     """Return the motor force along each drive's motion from its current [N].
 
-    It is the gear ratio times C_e I / r; NaN for wheels that do not drive, or without currents.
+    The force is the gear ratio times C_e I / r. It is NaN for wheels that do not drive, and for all
+    wheels if there are no currents.
     """
     rim = np.abs(run.speed * spec.wheel_radius)
     if run.current is None:
