@@ -85,12 +85,12 @@ class Code:
 
     @property
     def kept(self) -> int:
-        """Size of the state (estimator, controller and time of the path), as a count of numbers."""
+        """Total size of the states of estimator, controller and path [numbers]."""
         return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
 
     @property
     def scratch(self) -> int:
-        """Size of the arrays on the stack in the function with most of them [numbers]."""
+        """Largest total size of a function's arrays on the stack [numbers]."""
         return max(f.scratch for f in self.functions)
 
     def header(self) -> str:

@@ -160,7 +160,7 @@ def _memory(builder: Builder, like: Value, block: CodeBlock) -> Memory:
 
 
 def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
-    """Append a loop that applies a function repeatedly to its own results; return the last ones."""
+    """Append a loop that applies a function repeatedly to its results; return the last results."""
     scan = ScanParameters.of(params)
     carried, consts = scan.carried, scan.constants
     if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:

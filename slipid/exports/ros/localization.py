@@ -118,7 +118,7 @@ def top_speed(robot: DeployedRobot) -> float:
 
 
 def diagonal(planar: Axes) -> tuple[float, ...]:
-    """Return variances of x, y, z [m^2], roll, pitch, yaw [rad^2] from those of x, y and yaw."""
+    """Return variances of x, y, z [m^2], roll, pitch, yaw [rad^2]; `planar` has x, y and yaw."""
     x, y, yaw = planar
     return (x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw)
 

@@ -1,4 +1,4 @@
-"""Parameters of a ROS node `slipid`: those of the robot, with their paths in robot.json as names.
+"""Parameters of a ROS node `slipid`: the robot's parameters, named by their robot.json paths.
 
 Names of floors and load set-ups are converted by `identifiers`. Arrays with an element per wheel
 are in the order of robot.json; matrices are in row-major order.
