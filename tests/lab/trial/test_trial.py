@@ -576,7 +576,7 @@ def test_a_controller_can_have_another_map_than_the_true_one(tmp_path, deployed,
     for k, place in enumerate(middle):
         under = floor.under(jnp.array([*place, 0.0]), jnp.zeros((1, 2)))
         assert labels[int(under[0])] == labels[1 - k]
-    with pytest.raises(DataError, match=r"strange\.toml: no surface 'moss'"):
+    with pytest.raises(DataError, match=r"strange\.toml: surface 'moss' was not identified"):
         jobs(told_map=tmp_path / "strange.toml")
 
 
