@@ -65,7 +65,7 @@ class Capture:
 
 @dataclass(frozen=True, eq=False)
 class Video(FrameSource):
-    """A video file, with its own frame times or with given ones.
+    """A video file, with the frame times in the file or with times given by the user.
 
     Attributes:
         times: given time of each frame [s]; None to use `fps` or the times in the file.
@@ -99,7 +99,7 @@ class Video(FrameSource):
         return cls(str(path), size_of(first), count, times is not None, identity, times, fps)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the frames, beginning with number `first`; earlier ones are not decoded.
+        """Yield the frames, beginning with number `first`; earlier frames are not decoded.
 
         Raises:
             DataError: times in the file do not increase, or fewer times than frames were given.
@@ -213,7 +213,7 @@ class PictureFolder(FrameSource):
         return cls(str(place), size, len(paths), True, identity, tuple(paths), times)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the images from number `first`; raise `DataError` if one has another size."""
+        """Yield the images from number `first`; raise `DataError` if an image has another size."""
         for k in range(first, len(self.paths)):
             picture = read_picture(self.paths[k])
             if size_of(picture) != self.image_px:

@@ -150,7 +150,7 @@ def ideal_points(
     matrix: Float[np.ndarray, "3 3"],
     distortion: Float[np.ndarray, " coefficient"],
 ) -> Float[np.ndarray, "point 1 2"]:
-    """Return undistorted, normalised image coordinates: where a camera of focal length 1 sees them.
+    """Return pixels as normalised image coordinates, for focal length 1 and without distortion [1].
 
     The distortion is inverted by iteration to convergence.
     """

@@ -1,1 +1,1 @@
-"""Conversion of a fit or a posterior to the robot's record, and export of folders for a robot."""
+"""Conversion of a fit or a posterior to robot.json, and export of folders of files for a robot."""

@@ -27,13 +27,13 @@ class ControllerRow:
         observer: estimator: `encoder` (odometry without slip), `curve` (odometry with slip by
             current, wheel by wheel) or `contact` (`slipid.Estimator`).
         about: description for people.
-        correction: torque correction of the 2021 paper.
-        law: function that returns, for a robot, the published control law that replaces the pose
-            loop; None for the pose loop.
-        tuned: True if it uses the tuned gains of robot.json when they are better than those set by
+        correction: torque correction of the 2021 paper, see `slipid.robot.controller.Controller`.
+        law: function from a robot to a published control law that replaces the pose loop; None for
+            the pose loop.
+        tuned: True to use the tuned gains of robot.json if they are better than the gains set by
             hand.
         gyro: True if the robot has a gyro.
-        mapped: True if the estimator has the map of the site's floors.
+        mapped: True if the estimator uses a map of the site's floors.
     """
 
     observer: str
@@ -47,7 +47,7 @@ class ControllerRow:
     def drives(self, robot: DeployedRobot) -> bool:
         """Return whether the row applies to a robot.
 
-        Torque corrections have gains for three wheels only.
+        Torque corrections have gains only for robots with three wheels.
         """
         return self.correction == "none" or robot.wheels == PAPER_WHEELS
 
@@ -81,21 +81,21 @@ def control_loop_of(
 ) -> ControlLoop[eqx.Module]:
     """Return the control loop of a row for a robot.
 
-    Rows with tuned gains use them if they are better than those set by hand, or if `forced`.
-    `floor` is the map for rows that use one.
+    If `row.tuned`, tuned gains are used if they are better than the gains set by hand, or if
+    `forced`. `floor` is used only if `row.mapped`.
 
     Raises:
         DataError: the row does not apply to the robot's wheels.
     """
     if not row.drives(robot):
         raise DataError(
-            f"the torque correction of the 2021 paper has gains for {PAPER_WHEELS} wheels; this "
-            f"robot has {robot.wheels}"
+            f"the torque correction of the 2021 paper has gains for {PAPER_WHEELS} wheels, but "
+            f"this robot has {robot.wheels}; expected a controller without torque correction"
         )
     gains = Gains.of(robot, forced) if row.tuned else Gains()
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
-        gains = replace(gains, preview=jnp.asarray(0.0))  # The loop of the paper has no preview.
+        gains = replace(gains, preview=jnp.asarray(0.0))  # the 2021 paper's loop has no preview
     law = None if row.law is None else row.law(robot)
     return ControlLoop(estimator, Controller(robot, gains, correction=row.correction, law=law))

@@ -30,11 +30,11 @@ from slipid.support.errors import DataError
 
 ROBOT = "robot.json"
 NO_CONTROLLER = (
-    "the drives of this robot cannot produce every motion ahead, sideways and in yaw: it has an "
-    "estimator (slipid.Estimator), but no controller, so trial and export are not available; "
-    "identify, validate, compare, sample, selftest and design are"
+    "the drives of this robot cannot produce every motion ahead, sideways and in yaw: the robot "
+    "has an estimator (slipid.Estimator), but no controller, so `slipid trial` and `slipid export` "
+    "are not available; identify, validate, compare, sample, selftest and design are available"
 )
-"""Message for wheels that have no controller."""
+"""Message for robots that have no controller, see `DeployedRobot.steers`."""
 DRAWS = 64
 """Number of posterior draws in robot.json."""
 
@@ -42,8 +42,8 @@ DRAWS = 64
 def deploy(found: Fit | Posterior) -> DeployedRobot:
     """Return the robot of a fit or of its posterior, with its first load set-up.
 
-    Its parameters are those of `identified.json`. They come from the posterior if there is one,
-    else from the fit's Laplace approximation; `DeployedRobot.record.source` names the method.
+    Parameters are as in `identified.json`: from the posterior if one is given, else from the fit's
+    Laplace approximation. `DeployedRobot.record.source` is the method.
     """
     source: Source
     if isinstance(found, Posterior):
@@ -64,7 +64,7 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
         fit.current_trend,
         fit.validity,
     )
-    # If the fit used runs over several floors, the robot is expected to drive on several.
+    # a robot that was fitted to runs over several floors is expected to drive across edges
     alike = record.alike if fit.mixed is None else MIXED_FLOORS_PENALTY
     return DeployedRobot.of(
         replace(
@@ -91,9 +91,9 @@ def robot_of_force_balance(
     Args:
         contact: fitted force balance.
         highest_speed: highest wheel speed of the fitted runs [rad/s].
-        current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v
-            [A, A s/m], see `slipid.infer.slip_curves.current_trend`.
-        sensors: sensors of the logs; none by default.
+        current_trend: a [A] and b [A s/m] of the excess a + b v of measured over modelled currents
+            at a body speed v, see `slipid.infer.slip_curves.current_trend`.
+        sensors: sensors of the logs; by default no sensors besides encoders.
         load: name of the load set-up, by default the first one.
     """
     vectors = draws(contact.z, contact.covariance, DRAWS, seed=0)
@@ -116,7 +116,8 @@ def _record(
 ) -> RobotRecord:
     """Return the record of a robot.
 
-    `center` is the search vector of its parameters, and `vectors` are posterior draws of it.
+    `center` is the search vector of the robot's parameters, and `vectors` are posterior draws of
+    this vector.
     """
     return robot_record(
         robot,
@@ -131,9 +132,10 @@ def _record(
 
 
 def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
-    """Write robot.json into the folder of a fit; return the names of the files written."""
+    """Write robot.json into the folder of a fit; return the names of the written files."""
     robot, path = deploy(found), out / ROBOT
-    with suppress(DataError):  # keep tuned gains if the robot's parameters are unchanged
+    # keep tuned gains of an existing readable file if the robot's parameters are unchanged
+    with suppress(DataError):
         before = DeployedRobot.load(path).record if path.is_file() else robot.record
         if before.numbers == robot.record.numbers:
             robot = DeployedRobot.of(replace(robot.record, gains=before.gains))
@@ -144,18 +146,16 @@ def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
 def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()) -> DeployedRobot:
     """Return the robot in a file, or in a result folder of `slipid identify`.
 
-    The robot must be able to use a controller. `floors` are the names of its floors, by default
-    all.
+    `load` is the name of the load set-up, by default the first one. `floors` are the names of the
+    floors to keep, by default all.
 
     Raises:
-        DataError: there is no robot, its wheels have no controller, it has no such load set-up or
-            floor, or reading it fails as in `DeployedRobot.load`.
+        DataError: there is no robot, there is no controller for its wheels, it has no such load
+            set-up or floor, or reading it fails as in `DeployedRobot.load`.
     """
     path = source if source.suffix == ".json" else source / ROBOT
     if not path.is_file():
-        raise DataError(
-            f"{path}: missing; it is written by `slipid identify` with --out {path.parent}"
-        )
+        raise DataError(f"{path}: missing; write it by `slipid identify` with --out {path.parent}")
     robot = DeployedRobot.load(path, load)
     if not robot.steers:
         raise DataError(f"{path}: {NO_CONTROLLER}")
@@ -166,19 +166,19 @@ def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()
 
 
 def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
-    """Return the actuator model of a robot's twin, with the sensors of its logs."""
+    """Return the actuator model of a robot's twin, with the sensors that the robot's logs have."""
     sensors = robot.record.sensors
     return ActuatorModel(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
 
 
 def _number(e: Estimate) -> RecordedNumber:
-    """Return an estimate in the form of robot.json."""
+    """Convert an estimate of identified.json to a number of robot.json."""
     values = {f.name: getattr(e, f.name) for f in fields(RecordedNumber)}
     return typed(RecordedNumber, json.loads(json.dumps(values)), e.path)
 
 
 def given_numbers(robot: Robot) -> Mapping[str, RecordedNumber]:
-    """Return the numbers of a robot by path, recorded as given and not fitted."""
+    """Return the parameters of a robot, keyed by path and recorded as given instead of fitted."""
     return {
         e.path: RecordedNumber(plain(np.asarray(e.get(robot))), e.declaration.unit)
         for e in entries(robot)

@@ -1,4 +1,4 @@
-"""Export of robot.json to a folder for a robot, with an example run driven on the twin."""
+"""Export of a robot to a folder of files in several forms, with an example run on its twin."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ FORMS = ("c", "ros2", "stablehlo", "table")
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Choices of an export.
+    """Options of an export.
 
     Attributes:
         forms: forms to write, each one of `FORMS`.
-        controller: name of a row of `CONTROLLERS`, or of another table of rows.
+        controller: name of a controller, which is a key of the argument `rows` of `export`.
         path: name of the path that the example in C follows.
         speed: speed along the path [m/s].
         map: file of a floor map for a controller that uses one; None without a map.
@@ -64,9 +64,9 @@ class Exported:
 
     Attributes:
         folder: path of the folder.
-        files: names of its files.
+        files: names of the folder's files.
         robot: hash of the robot's parameters.
-        forms: forms that it contains.
+        forms: forms that the folder contains.
         warnings: warnings about parameters that are not identified, at a bound or disputed.
     """
 
@@ -87,8 +87,9 @@ def export(
     """Write a robot, with one of the controllers `rows`, in all requested forms to a folder.
 
     Raises:
-        DataError: there is no such form, controller or path, a step cannot be converted to C, or
-            the folder cannot be written or contains other files.
+        DataError: there is no such form, controller or path, the speed is too high, the map has an
+            unknown surface, a step cannot be converted to C, or the folder cannot be written or
+            contains other files.
     """
     row = _checked_row(options, rows)
     check_writable(out)
@@ -124,13 +125,13 @@ def export(
 
 
 def _checked_row(options: ExportOptions, rows: Mapping[str, ControllerRow]) -> ControllerRow:
-    """Return the row of the chosen controller; raise `DataError` for options that do not fit."""
+    """Return the row of the chosen controller; raise `DataError` for inconsistent options."""
     if not options.forms:
-        raise DataError(f"no form; expected one or more of {', '.join(FORMS)}")
+        raise DataError(f"no form is given; expected one or more of {', '.join(FORMS)}")
     for name in options.forms:
         if name not in FORMS:
             raise DataError(
-                f"no form '{name}'{did_you_mean(name, FORMS)}; expected {', '.join(FORMS)}"
+                f"no form '{name}'{did_you_mean(name, FORMS)}; expected one of {', '.join(FORMS)}"
             )
     controller = options.controller
     if controller not in rows:
@@ -141,7 +142,8 @@ def _checked_row(options: ExportOptions, rows: Mapping[str, ControllerRow]) -> C
         raise DataError(f"controller {controller} needs a map of the floors; give one with --map")
     if options.map is not None and not row.mapped:
         raise DataError(
-            f"controller {controller} uses no map; omit --map, or use --controller contact_map"
+            f"controller {controller} does not use a map; omit --map, or use --controller "
+            "contact_map"
         )
     return row
 
@@ -160,7 +162,7 @@ def record_example(
         path: path that begins at `start`.
         plant: the twin.
         start: pose at which the estimator starts [m, m, rad].
-        name: name of the path, for the description.
+        name: name of the path, for the description of the recording.
     """
     run = run_closed_loop(loop, path, plant, start)
     readings = [plant.reset(), *map(plant.step, run.command[:-1])]

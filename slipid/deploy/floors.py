@@ -16,16 +16,16 @@ from slipid.support.errors import DataError
 
 
 def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
-    """Return a map as arrays, with surfaces numbered as in `labels` and -1 for all others."""
+    """Convert a map to arrays, with surfaces numbered as in `labels` and -1 for other surfaces."""
     return Floor.of(floor.surfaces, floor.cells, floor.corner, floor.cell, labels)
 
 
 def floor_map(path: Path | str, robot: DeployedRobot) -> Floor:
     """Return the floor map in a TOML file, in the form that a robot's `Estimator` uses.
 
-    For a robot on which only jax is installed, write the map with `Floor.save` and read it there
-    with `Floor.load`. Cells with surfaces that were not identified give the estimator no
-    information.
+    For a robot whose computer has only jax, equinox and numpy, write the map with `Floor.save` and
+    read it there with `Floor.load`. Cells with surfaces that were not identified give the estimator
+    no information.
 
     Raises:
         DataError: the file is not a map, or contains none of the robot's surfaces.
@@ -33,7 +33,8 @@ def floor_map(path: Path | str, robot: DeployedRobot) -> Floor:
     floor = read_map(Path(path))
     if not set(floor.surfaces) & set(robot.labels):
         raise DataError(
-            f"{path}: surfaces {', '.join(floor.surfaces)}; expected some of those identified: "
+            f"{path}: the map has only surfaces that were not identified "
+            f"({', '.join(floor.surfaces)}); expected a map with one or more of "
             f"{', '.join(robot.labels)}"
         )
     return floor_of(floor, robot.labels)
@@ -44,10 +45,10 @@ class WheelFloors(eqx.Module):
 
     Attributes:
         surface: index of the surface in the map's list of surfaces.
-        border: distance from the middle of the wheel to the nearest other surface [m], to within
-            half a cell of the map; infinite on a map of a single surface.
-        inside: True if the wheel is on the map; outside it, surface and border are those of the
-            nearest cell.
+        border: distance from the middle of the wheel to the nearest other surface [m], accurate to
+            half a cell of the map; infinite on a map with a single surface.
+        inside: True if the wheel is on the map; outside the map, surface and border are those of
+            the nearest cell.
     """
 
     surface: Int[Array, "*batch wheel"]
@@ -59,7 +60,7 @@ class FloorLookup(eqx.Module):
     """Floor map for jitted functions that look up the floor under each wheel and its border.
 
     Attributes:
-        floor: surfaces by cell, numbered as in `surfaces`.
+        floor: map whose cells are indices into `surfaces`.
         border: distance from the middle of every cell to the nearest other surface [m].
         surfaces: names of the surfaces.
     """
@@ -85,11 +86,11 @@ class FloorLookup(eqx.Module):
 
     @eqx.filter_jit
     def under(self, pose: Float[Array, "*batch 3"], wheels: Float[Array, "wheel 2"]) -> WheelFloors:
-        """Return the floor under each wheel, and its distance to the border, at some poses.
+        """Return the floor under each wheel, and the wheel's distance to the border, at each pose.
 
         Args:
             pose: x, y [m], heading [rad] of the body on the map.
-            wheels: places of the wheels on the body, x ahead, y left [m].
+            wheels: positions of the wheels on the body, x ahead, y left [m].
         """
         flat = pose.reshape(-1, 3)
         row, column = jax.vmap(self.floor.steps_to, (0, None))(flat, wheels)

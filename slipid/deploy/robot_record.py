@@ -1,17 +1,18 @@
 """Record of a robot: its parameters, and quantities computed once from the model.
 
-The effect table of robot.json follows from the effects that fitted runs share. As in forecasts
+The effect table of robot.json is computed from the effects that fitted runs share. As in forecasts
 (`slipid.fitting.shared_effects`), the motion along, across and in yaw, per metre that the wheels
 would roll without slip, is predicted to be
 
     contact(z) - shared(z),   shared(z) = mean + slope (z - z_fit)
 
-with z the search vector, z_fit its value at the fit, contact(z) the motion by the contact model and
-shared(z) the effect estimated from the fitted runs. The table's mean is -shared at the robot's
-numbers. Its remaining variance is that of effects of single runs, plus two parts that are increased
-for extrapolation as in forecasts: the variance of the shared effects given the numbers, and the
-scatter of the predicted motion over posterior draws of z. Near fitted runs that scatter is small,
-since the estimated effect changes with the numbers and compensates them.
+where z is the search vector (the robot's free parameters), z_fit its value at the fit, contact(z)
+the motion by the contact model and shared(z) the effect estimated from the fitted runs. The table's
+mean is -shared(z) at the robot's parameters. The table's remaining variance is the variance of
+effects of single runs, plus two terms that are increased for extrapolation as in forecasts: the
+variance of the shared effects at given parameters, and the scatter of the predicted motion over
+posterior draws of z. Near fitted runs that scatter is small, since the estimated effect changes
+with the parameters and compensates for them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -48,20 +49,20 @@ def robot_record(
     seen: Mapping[str, Validity],
     effects: Mapping[str, EffectRecord] = MappingProxyType({}),
 ) -> record.RobotRecord:
-    """Return the record of a robot; its fields about the source of the numbers have defaults.
+    """Return the record of a robot, with default values of the fields about the record's origin.
 
     Args:
-        robot: robot with every number at its value in `numbers`.
-        numbers: parameters keyed by path; those of the camera are not recorded.
-        std: std of every variance component by name (such as `process.gray.along`), as used in
-            forecasts of new runs.
-        draws: posterior draws of the robot, stacked, from which the uncertainty of the motion is
-            computed.
+        robot: robot with every parameter at its value in `numbers`.
+        numbers: parameters keyed by path; the camera's parameters are not recorded.
+        std: std of every variance component, keyed by its name such as `process.gray.along`, as
+            used in forecasts of new runs.
+        draws: posterior draws of the robot, stacked along a leading axis, from which the
+            uncertainty of the motion is computed.
         highest_speed: highest wheel speed of the fitted runs [rad/s].
-        current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v
-            [A, A s/m].
-        seen: ranges that the fitted runs cover, by floor; floors may be absent.
-        effects: effect tables by load set-up; load set-ups may be absent.
+        current_trend: a [A] and b [A s/m] of the excess a + b v of measured over modelled currents
+            at a body speed v.
+        seen: ranges that the fitted runs cover, keyed by floor; floors may be absent.
+        effects: effect tables keyed by load set-up; load set-ups may be absent.
     """
     return record.RobotRecord(
         wheels=record.Wheels(
@@ -79,7 +80,10 @@ def robot_record(
 
 
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
-    """Yield path and draws of every parameter that varies over draws, except the camera's."""
+    """Yield path and draws of every parameter that was fitted, except the camera's.
+
+    A fitted parameter is recognised by values that differ between draws.
+    """
     for e in entries(robot):
         leaf = np.asarray(e.whole(draws))
         rows = leaf if e.index is None else leaf[:, e.index]
@@ -88,7 +92,10 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
-    """Return the record of a floor's errors, from the stds of variance components keyed by name."""
+    """Return the record of a floor's errors; `std` has variance components keyed by name.
+
+    Tuples of numbers, and 0.05, are the stds that are assumed if a component is absent.
+    """
     shared = sum(on_floor(std, kind, name) ** 2 for kind in SHARED)
     effect = np.sqrt(on_floor(std, "run", name, (0.01, 0.01, 0.03)) ** 2 + shared)
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
@@ -127,17 +134,17 @@ def directions(count: int) -> Float[np.ndarray, "twist 3"]:
 
 
 def _turns(frame: WheelFrame) -> Float[np.ndarray, "twist 3"]:
-    """Return twists [m/s, m/s, rad/s] on the spot, left and right, at about 1 m/s rim speed."""
+    """Return twists [m/s, m/s, rad/s] that turn left and right at about 1 m/s rim speed."""
     return np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / np.asarray(frame.base)
 
 
 def _operating_points(
     robot: Robot, load: int, top: float, twists: Float[np.ndarray, "twist 3"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return wheel speeds [rad/s], currents [A] and slip ratios [1] at some twists on every floor.
+    """Return wheel speeds [rad/s], currents [A] and slip ratios [1] at given twists on every floor.
 
-    Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has the
-    shape (floor and twist, drive).
+    Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has a row
+    for every floor, speed and twist, and a column for every drive.
     """
     frame = robot.geometry.frame()
     forward, radius = np.asarray(frame.forward()), float(frame.radius)
@@ -158,9 +165,9 @@ def _wheel_curve(
 ) -> Float[np.ndarray, "drive 2"]:
     """Return a and b of the slip ratio a + b |I| of each drive, fitted over all floors [1, 1/A].
 
-    It is the form that the 2021 paper's robot used, refitted here to the contact model. The slip
-    speed, wheel speed times slip ratio, is fitted by least squares, so that slow wheels have little
-    weight.
+    The form a + b |I| was used on the 2021 paper's robot; here it is fitted to the contact model.
+    Least squares are applied to the slip speed (wheel speed times slip ratio), so that slow wheels
+    have little weight.
     """
     a = np.stack([speed, speed * np.abs(amps)], axis=-1)
     normal = np.einsum("nda,ndb->dab", a, a)
@@ -172,9 +179,9 @@ def _spread(
 ) -> Float[np.ndarray, "floor 3"]:
     """Return the posterior std of the motion per metre on each floor, along, across and in yaw.
 
-    Units are [m/m, m/m, rad/m]. It is the root mean square over all directions of travel. For
-    robots that cannot drive sideways it is the largest over driving ahead, back and turning on the
-    spot.
+    Units are [m/m, m/m, rad/m]. The std is the root mean square over all directions of travel. For
+    robots that cannot drive sideways it is the largest std of driving ahead, driving back and
+    turning on the spot.
     """
     free = robot.geometry.determines_twist
     twists = directions(12) if free else np.concatenate([directions(2), _turns(frame)])
@@ -183,9 +190,9 @@ def _spread(
 
 
 def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*rest"]:
-    """Return the std over draws, as half the width of their central 68 %.
+    """Return the std over draws, estimated as half the width of their central 68 %.
 
-    A few outliers among the draws do not affect it.
+    Unlike the usual estimate, it is not affected by a few outliers among the draws.
     """
     low, high = np.quantile(draws, (0.1587, 0.8413), axis=0)
     return np.asarray(high - low) / 2
@@ -198,7 +205,7 @@ def moved_per_metre(
 
     Args:
         draws: robots stacked along a leading axis.
-        load: number of the load set-up.
+        load: index of the load set-up.
         speed: speed of the body without slip [m/s].
         twist: twists of 1 m/s [m/s, m/s, rad/s].
     """
@@ -217,7 +224,7 @@ def moved_per_metre(
 def _equilibria(
     frames: WheelFrame, surface: ContactSurface, rest: Array, twist: Array
 ) -> Float[Array, "row 3"]:
-    """Return the twists of robots whose wheels roll as for given twists without slip."""
+    """Return the twists by contact equilibrium, for wheel speeds that without slip give `twist`."""
 
     def one(frame: WheelFrame, surface: ContactSurface, rest: Array, twist: Array) -> Array:
         rim = frame.at_wheels(frame.forward() @ twist)
@@ -227,7 +234,8 @@ def _equilibria(
 
 
 DIRECTIONS = 72
-"""Number of directions in the effect table: half the width of the effects' kernel apart."""
+"""Number of directions in the effect table; they are half the width of the effects' Gaussian kernel
+apart."""
 _Grid = Float[np.ndarray, "floor speed direction 3"]
 
 
@@ -238,7 +246,7 @@ def effects_by_load(
 
     Args:
         contact: fitted force balance.
-        center: search vector of the robot's numbers.
+        center: search vector of the robot's parameters.
         draws: posterior draws of the search vector.
     """
     speeds = {s.log_speed for shared in contact.shared.values() for s in shared.speeds_and_loads}
@@ -261,7 +269,8 @@ def _effect_table(
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
     k = contact.robot.load_index(load)
     moved = [moved_per_metre(robots, k, np.exp(s), directions(DIRECTIONS)) for s in log_speed]
-    predicted = np.concatenate(moved, axis=2)  # directions for each speed
+    # join the speeds along the axis of twists, in the order of `rows`: all directions of a speed
+    predicted = np.concatenate(moved, axis=2)
     shape = (len(labels), count, DIRECTIONS, len(AXES))
     mean, left = np.zeros(shape), np.zeros(shape)
     for n, floor in enumerate(labels):
@@ -284,5 +293,5 @@ def _rows(grid: _Grid) -> tuple[tuple[tuple[record.Axes, ...], ...], ...]:
 
 
 def _rounded(value: float) -> float:
-    """Return a number rounded to four digits, more than its accuracy, to keep the table short."""
+    """Round a number to four digits, which exceeds its accuracy, to keep the table short."""
     return float(f"{value:.4g}")

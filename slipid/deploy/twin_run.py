@@ -18,10 +18,11 @@ REST_S = 1.0
 
 
 def twin_floor(robot: DeployedRobot) -> FloorMap:
-    """Return a map of patches about as large as the robot, half of them with the least slip.
+    """Return a map of patches about as large as the robot, on the robot's floors.
 
+    The floor with the least slip in the fitted runs is drawn twice as often as each other floor.
     With the firm, medium and soft floors of the test site, a robot controlled by encoder odometry
-    then travels 80 to 90 % of the first side, as on the site of the paper.
+    then travels 80 to 90 % of the path's first side, as on the 2021 paper's site.
     """
     labels = robot.labels
     slip = [float(np.mean(f.seen.slip)) if f.seen is not None else 0.0 for f in robot.record.floors]
@@ -33,10 +34,10 @@ def twin_floor(robot: DeployedRobot) -> FloorMap:
 
 
 def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, float]]:
-    """Return start poses [m, m, rad] spread over a site, the same at every call.
+    """Return start poses [m, m, rad] spread over a site, the same poses at every call.
 
-    Headings are evenly spread. The middle of the path, which begins at the start pose, stays 0.8 m
-    away from the edge of the site if there is room.
+    Headings are evenly spread. The path begins at the start pose, and its middle stays at least
+    0.8 m inside the site if the site is large enough.
     """
     rng = np.random.default_rng(STARTS_SEED)
     x0, y0, x1, y1 = floor.extent
@@ -54,14 +55,20 @@ def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, 
 
 
 def require_known_surfaces(floor: FloorMap, robot: DeployedRobot, path: str) -> None:
-    """Raise `DataError` if a map, read from `path`, has a surface that was not identified."""
+    """Raise `DataError` if a map, read from `path`, has a surface that was not identified.
+
+    The twin needs the parameters of every surface.
+    """
     if absent := [name for name in floor.surfaces if name not in robot.labels]:
         known = ", ".join(robot.labels)
-        raise DataError(f"{path}: no surface '{absent[0]}'; identified: {known}")
+        raise DataError(
+            f"{path}: surface '{absent[0]}' was not identified; expected only surfaces out of "
+            f"{known}"
+        )
 
 
 def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
-    """Return the path with this name, which begins at the origin, at a speed [m/s].
+    """Return the path called `name`, which begins at the origin, for a speed [m/s].
 
     Raises:
         DataError: there is no such path, or the speed exceeds the highest rim speed of the fitted
@@ -72,8 +79,8 @@ def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
     most = float(robot.highest[0] * robot.frame.radius)
     if not 0 < speed <= most:
         raise DataError(
-            f"speed {speed:g} m/s; expected above 0 and at most {most:.2g} m/s, the highest "
-            "rim speed of the fitted runs"
+            f"speed {speed:g} m/s; expected a speed above 0 and at most {most:.2g} m/s, the "
+            "highest rim speed of the fitted runs"
         )
     return trajectory.PATHS[name](speed)
 

@@ -1,4 +1,4 @@
-"""Texts common to exported files: numbers of a robot, their source, warnings and the README."""
+"""Texts common to exported files: a robot's parameters, their source, warnings and the README."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,14 +14,14 @@ from slipid.robot.robot_file import declared_numbers
 
 VERDICTS: Mapping[Verdict, str] = {
     "identified": "determined by the logs",
-    "weak": "the logs reduce its uncertainty, but its prior still counts: note its interval",
-    "disputed": "its estimates on different floors disagree: do not use it under other conditions "
-    "than those of the logs",
+    "weak": "the logs reduce its uncertainty, but its prior still has influence: note its interval",
+    "disputed": "its estimates on different floors disagree: use it only under the conditions of "
+    "the logs",
     "not_identified": "the logs do not determine it: its value is an assumption (the prior), not a "
     "measurement. Do not rely on it without measuring it in another way",
-    "at_bound": "the fit ended at a bound of its possible values. The model, or a number that was "
-    "held fixed, may be wrong",
-    "fixed": "it was given by the user and not fitted",
+    "at_bound": "the fit ended at a bound of its possible values. The model, or a parameter that "
+    "was held fixed, may be wrong",
+    "fixed": "it was given by the user instead of fitted",
 }
 PROVENANCES: Mapping[Provenance, str] = {
     "measured": "the logs",
@@ -30,27 +30,28 @@ PROVENANCES: Mapping[Provenance, str] = {
 }
 WARNINGS: Mapping[Verdict, str] = {
     "not_identified": "NOT IDENTIFIED (their values are assumptions, not measurements)",
-    "at_bound": "AT A BOUND (the model, or a number that was held fixed, may be wrong)",
+    "at_bound": "AT A BOUND (the model, or a parameter that was held fixed, may be wrong)",
     "disputed": "DISPUTED (their estimates on different floors disagree)",
 }
-"""Warning for each verdict about which a user must be warned."""
+"""Warning text for each verdict of which users must be warned."""
 
 
 @dataclass(frozen=True)
 class NumberRow:
-    """One number of a robot, as a row of a table.
+    """One parameter, gain, limit or matrix element of a robot, as a row of a table.
 
     Attributes:
-        group: key of the table to which it belongs.
+        group: key of the table to which the row belongs.
         name: name of the number; its path if it is in robot.json.
-        entry: wheel to which it belongs, such as "wheel 2"; empty for a number of the whole robot.
+        entry: wheel to which the number belongs, such as "wheel 2"; empty for a number of the whole
+            robot.
         symbol: symbol in equations.
         value: value [unit].
         unit: unit of the value.
         interval90: 90 % interval [unit]; None if there is none.
-        verdict: verdict on its identification, as text for people.
-        provenance: source of its value, as text for people.
-        about: meaning in words.
+        verdict: verdict on the number's identification, as text for people.
+        provenance: source of the value, as text for people.
+        about: meaning of the number in words.
     """
 
     group: str
@@ -66,19 +67,19 @@ class NumberRow:
 
     @property
     def verdict_markdown(self) -> str:
-        """Verdict as Markdown, in bold if users must be warned about it."""
+        """Verdict as Markdown, in bold if users must be warned of it."""
         warned = self.verdict in map(verdict_text, WARNINGS)
         return f"**{self.verdict}**" if warned else self.verdict
 
 
 def verdict_text(verdict: Verdict) -> str:
-    """Return a verdict as text for people, in capitals if they must be warned about it."""
+    """Return a verdict as text for people, in capitals if users must be warned of it."""
     words = verdict.replace("_", " ")
     return words.upper() if verdict in WARNINGS else words
 
 
 def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
-    """Yield a row for every number of a robot, and one per wheel for numbers of wheels."""
+    """Yield a row for every parameter of a robot; a parameter of wheels has one row per wheel."""
     for e in declared_numbers(robot.record):
         number, d, group = robot.record.parameters[e.path], e.declaration, e.path.partition(".")[0]
         ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2)).tolist()
@@ -91,9 +92,9 @@ def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
 
 LIMITS: Mapping[str, tuple[str, str]] = {
     "wheel_speed": ("rad/s", "largest speed of a wheel"),
-    "acceleration": ("rad/s^2", "largest change of a wheel's speed"),
-    "voltage": ("V", "of the supply"),
-    "twist": ("m/s", "largest speed demanded of the body"),
+    "acceleration": ("rad/s^2", "largest acceleration of a wheel"),
+    "voltage": ("V", "supply voltage"),
+    "twist": ("m/s", "largest translational speed demanded of the body"),
 }
 """Unit and meaning of every field of `slipid.robot.controller.Limits`."""
 
@@ -101,8 +102,8 @@ LIMITS: Mapping[str, tuple[str, str]] = {
 def gains_origin(robot: DeployedRobot) -> str:
     """Return sentences about the origin of a robot's gains and limits, which are not identified."""
     limits = (
-        "The limits are defaults of slipid and not identified: enter those of your motors and "
-        "supply."
+        "The limits are defaults of slipid and not identified: enter the limits of your motors and "
+        "supply instead."
     )
     tuned = robot.record.gains
     if tuned is None:
@@ -115,7 +116,7 @@ def gains_origin(robot: DeployedRobot) -> str:
     loss = f"loss {tuned.loss.tuned:.1f} mm, by hand {tuned.loss.hand:.1f} mm"
     gyro = "with a gyro" if tuned.gyro else "without a gyro"
     return (
-        f"Gains tuned on the twin {gyro}, better than those set by hand in simulated runs "
+        f"Gains tuned on the twin {gyro}, better than the gains set by hand in simulated runs "
         f"({loss}). {limits}"
     )
 
@@ -128,17 +129,17 @@ SOURCES: Mapping[Source, str] = {
 
 
 def header(robot: DeployedRobot) -> list[str]:
-    """Return comment lines, without comment signs, about the source of an exported file.
+    """Return comment lines, without comment signs, about the robot of an exported file.
 
-    They give the source, floors, loads, verdicts and warnings. Each line is plain printable text of
-    at most 96 characters, unless a single word is longer.
+    The lines give source, floors, load set-ups, verdicts and warnings. Each line is plain printable
+    text of at most `COMMENT_WIDTH` characters, unless a single word is longer.
     """
     sentences = (*_sentences(robot), *(f"WARNING: {text}" for text in warnings(robot)))
     return [line for sentence in sentences for line in wrapped(sentence)]
 
 
 def in_markdown(robot: DeployedRobot) -> list[str]:
-    """Return the content of `header` as Markdown, warnings first, plus the fit's messages."""
+    """Return the content of `header` as Markdown, warnings first, and the fit's messages."""
     return [*warned(robot), *facts(robot)]
 
 
@@ -148,13 +149,13 @@ def warned(robot: DeployedRobot) -> list[str]:
 
 
 def facts(robot: DeployedRobot) -> list[str]:
-    """Return source, floors, loads, verdicts and messages of the fit as a list in Markdown."""
+    """Return source, floors, load set-ups, verdicts and the fit's messages as a Markdown list."""
     notes = (f"Note of the fit: {message}" for message in robot.record.messages)
     return [*(f"- {one_line(part)}" for part in (*_sentences(robot), *notes)), ""]
 
 
 def warnings(robot: DeployedRobot) -> tuple[str, ...]:
-    """Return a warning for each verdict in `WARNINGS` that any number of the robot has."""
+    """Return a warning for each verdict in `WARNINGS` that any parameter of the robot has."""
     known = {e.path: robot.record.parameters[e.path] for e in declared_numbers(robot.record)}
     by_verdict = {
         verdict: [path for path, number in known.items() if number.verdict == verdict]
@@ -164,11 +165,11 @@ def warnings(robot: DeployedRobot) -> tuple[str, ...]:
 
 
 def _sentences(robot: DeployedRobot) -> Iterator[str]:
-    """Yield sentences about source, floors, loads and verdicts."""
+    """Yield sentences about source, floors, load set-ups and verdicts."""
     record = robot.record
     yield f"Made by slipid {made_with()} from robot.json; export it again instead of editing it."
-    yield f"Numbers: {record.numbers} (`numbers` of robot.json)."
-    yield f"Source of the numbers: {SOURCES[record.source]}."
+    yield f"Hash of the parameters: {record.numbers} (`numbers` in robot.json)."
+    yield f"Source of the parameters: {SOURCES[record.source]}."
     loads = listed([load.name for load in record.loads])
     yield f"Load set-up: {one_line(robot.load_setup)}; identified load set-ups: {loads}."
     yield f"Floors: {listed(robot.labels)}."
@@ -178,7 +179,7 @@ def _sentences(robot: DeployedRobot) -> Iterator[str]:
 
 
 def made_with() -> str:
-    """Return the version of slipid that makes an export."""
+    """Return the version of slipid that writes an export."""
     try:
         return version("slipid")
     except PackageNotFoundError:
@@ -189,10 +190,11 @@ ABOUT: Mapping[str, str] = {
     "c": "estimator and controller in C99, with a test and an example; also a library for "
     "PlatformIO and the Arduino IDE",
     "ros2": "parameters for drive controllers of ros2_controllers, for robot_localization, and for "
-    "your own node (with their declaration)",
-    "stablehlo": "the same step for programs in JAX: `jax.export.deserialize`, or "
-    "`slipid.exports.stablehlo.load_program`, which compares it first",
-    "table": "gains, limits and matrices as tables, for entering them by hand",
+    "your own node (with the input for `generate_parameter_library`)",
+    "stablehlo": "a step of estimator and controller for programs in JAX: load it by "
+    "`jax.export.deserialize`, or by `slipid.exports.stablehlo.load_program`, which also checks "
+    "its results",
+    "table": "gains, limits, matrices and parameters as tables, for entering them by hand",
 }
 
 

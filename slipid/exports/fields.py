@@ -1,6 +1,6 @@
 """Structs of the generated code, with a field for every array of a state, an input or an output.
 
-The comment of a field is the description of the attribute in the Python class's docstring, which
+A field's comment is the description of the attribute in the docstring of the Python class; it
 contains the unit in brackets.
 """
 
@@ -23,16 +23,16 @@ Kind = Literal["real", "int", "bool"]
 DTYPES: dict[Kind, type] = {"real": np.float64, "int": np.int64, "bool": np.bool_}
 UNIT = re.compile(r"\[[^\]]+\]")
 NO_UNIT = "[1]"
-"""Unit written for a field whose description has none."""
+"""Unit that is added to a field's description if the description has no unit."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """An array of numbers, a member of a struct; attributes are keys of step.json.
+    """An array of numbers that is a member of a struct; its attributes are keys in step.json.
 
     Attributes:
         name: name in C.
-        numbers: kind of its numbers.
+        numbers: kind of the array's numbers.
         shape: shape of the array; () for a single number.
         about: meaning and unit of the field.
     """
@@ -54,8 +54,8 @@ class Struct:
 
     Attributes:
         name: name of the type, without the prefix `slipid_`.
-        fields: fields in the order of the tree's leaves.
-        example: a tree whose arrays have the shapes of the fields.
+        fields: fields, in the order of the leaves of `example`.
+        example: tree (as in `jax.tree`) whose arrays have the shapes of the fields.
     """
 
     name: str
@@ -64,23 +64,24 @@ class Struct:
 
 
 def kind_of(dtype: np.dtype) -> Kind:
-    """Return the kind of number for a data type of jax or numpy."""
+    """Return the kind of number of a data type of jax or numpy."""
     if dtype == np.bool_:
         return "bool"
     return "int" if np.issubdtype(dtype, np.integer) else "real"
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """Return the description of every attribute in a class's docstring."""
+    """Return the description of every attribute in a class's docstring, keyed by its name."""
     _, _, text = (inspect.getdoc(kind) or "").partition("Attributes:\n")
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", text, re.MULTILINE)
     return {name: " ".join(about.split()).rstrip(";.") for name, about in found}
 
 
 def structs_of(loop: ControlLoop[eqx.Module]) -> tuple[Struct, Struct, Struct, Struct]:
-    """Return the structs of a loop: estimator, controller, reading, and estimate.
+    """Return the structs of a control loop: estimator, controller, reading, and estimate.
 
-    They are the two states, the input and the output of its steps.
+    The first two are the states of estimator and controller; reading and estimate are the input and
+    the output of the estimator's step.
     """
     begin, nothing = loop.init(), Readings.nothing(loop.controller.robot.wheels)
     estimate = loop.estimator.step(begin.estimator, nothing, jnp.zeros(()))[1]
@@ -95,11 +96,11 @@ def structs_of(loop: ControlLoop[eqx.Module]) -> tuple[Struct, Struct, Struct, S
 def fields_of(
     tree: object, documented: type | None = None, prefix: str = "", above: str = ""
 ) -> tuple[Field, ...]:
-    """Return a field for every leaf of a tree of arrays, or of modules with documented attributes.
+    """Return a field for every array in a tree of modules with documented attributes.
 
     Args:
-        tree: arrays, in modules that may contain further modules.
-        documented: class whose docstring describes the attributes; by default that of the tree.
+        tree: an array, or a module that contains arrays and further modules.
+        documented: class whose docstring describes the attributes; by default the tree's class.
         prefix: beginning of the fields' names.
         above: description of the attribute that contains the tree, used for leaves without a
             description.

@@ -1,7 +1,7 @@
 """A folder for a robot: robot.json, its exported forms, and a checksum of every file.
 
-`sha256sum -c SHA256SUMS` checks the folder without slipid. Folders named `build` are ignored: they
-contain files that users build from the exported ones.
+`sha256sum -c SHA256SUMS` checks the folder without slipid. Folders called `build` are ignored,
+since they contain files that users build from the exported files.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ BUILD = "build"
 def write_folder(folder: Path, content: Mapping[str, bytes]) -> None:
     """Write files and their checksums into a folder, and remove all files of an older export.
 
-    Checksums are written first: a folder that lacks some files is then recognized as an incomplete
-    export, and can be written again.
+    Checksums are written first, so that a folder that lacks some files is recognized as an
+    incomplete export and can be written again.
 
     Raises:
-        DataError: as in `check_writable`, or the folder cannot be written.
+        DataError: the folder is refused by `check_writable`, or cannot be written.
     """
     check_writable(folder)
     for name in sorted(_files(folder) - {SUMS}):
@@ -43,8 +43,10 @@ def write_folder(folder: Path, content: Mapping[str, bytes]) -> None:
 def check_writable(folder: Path) -> None:
     """Raise `DataError` unless a folder is absent, empty or an unchanged export.
 
+    An interrupted export counts as unchanged.
+
     Raises:
-        DataError: the path is not a folder, or a file in it was added or changed by hand.
+        DataError: the path is not a folder, or a file in the folder was added or changed by hand.
     """
     if not folder.exists():
         return
@@ -53,16 +55,17 @@ def check_writable(folder: Path) -> None:
     sums = _sums(folder) if (folder / SUMS).is_file() else {}
     for name in sorted(_files(folder) - {SUMS}):
         if _name_of_temporary(name) in {SUMS, *sums}:
-            continue  # a temporary file of an interrupted export may be overwritten
+            # accept a temporary file that an interrupted export left; it is removed
+            continue
         if name not in sums:
             raise DataError(
-                f"{folder}: contains files that are not from an export ({name}); expected another "
-                "folder (--out)"
+                f"{folder}: contains files that an export did not write ({name}); expected an "
+                "empty or new folder (--out)"
             )
         if _sum((folder / name).read_bytes()) != sums[name]:
             raise DataError(
-                f"{folder / name}: changed since it was written, and would be overwritten; move "
-                "it elsewhere, or choose another folder (--out)"
+                f"{folder / name}: changed since it was exported, and would be overwritten; move "
+                "the file elsewhere, or choose another folder (--out)"
             )
 
 
@@ -81,19 +84,23 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
             raise DataError(f"{place / name}: {error.strerror}; export the robot again") from error
         if _sum(data) != expected:
             raise DataError(
-                f"{place / name}: changed or damaged since it was written; export the robot "
+                f"{place / name}: changed or damaged since it was exported; export the robot "
                 "again, to another folder"
             )
     if more := sorted(_files(place) - set(sums) - {SUMS}):
         raise DataError(
-            f"{place / more[0]}: added after the folder was written; move it elsewhere, or "
-            "export the robot again"
+            f"{place / more[0]}: added after the export; move the file elsewhere, or export the "
+            "robot again"
         )
     return tuple(sums)
 
 
 def _sums(folder: Path) -> dict[str, str]:
-    """Return the checksums in the folder's checksum file, keyed by file name."""
+    """Return the checksums in a folder's `SHA256SUMS`, keyed by the file's path in the folder.
+
+    Raises:
+        DataError: the file is absent, or a line does not have the form of `sha256sum`.
+    """
     try:
         text = (folder / SUMS).read_text()
     except (OSError, UnicodeDecodeError):
@@ -102,19 +109,20 @@ def _sums(folder: Path) -> dict[str, str]:
     named = {line[2]: line[1] for line in lines if line and ".." not in line[2].split("/")}
     if not lines or len(named) < len(lines):
         raise DataError(
-            f"{folder / SUMS}: cannot be read; expected a folder written by `slipid export`"
+            f"{folder / SUMS}: absent, or not a list of checksums; expected a folder that `slipid "
+            "export` wrote"
         )
     return named
 
 
 def _name_of_temporary(name: str) -> str | None:
-    """Return the name that a temporary file of `write_bytes` would get; None for other files."""
+    """Return the final name of a temporary file of `write_bytes`; None for other files."""
     match = re.fullmatch(r"((?:.*/)?)\.(.+)\.[0-9a-f]{8}", name)
     return None if match is None else match[1] + match[2]
 
 
 def _files(folder: Path) -> set[str]:
-    """Return the paths of the files in a folder, except those in folders named `build`."""
+    """Return the paths of the files in a folder, except files in folders called `build`."""
     paths = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     return {p.as_posix() for p in paths if BUILD not in p.parts}
 

@@ -1,4 +1,4 @@
-"""Reference steps (inputs and outputs of the library) that an exported program must reproduce."""
+"""Reference steps: inputs and outputs of slipid's own steps, which an export must reproduce."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ GOLDEN_STEPS = 48
 
 @dataclass(frozen=True)
 class Golden:
-    """Successive steps of a robot that starts at rest at the pose 0, 0, 0, one row each.
+    """Successive steps of a robot that starts at rest at the pose 0, 0, 0, one row for each step.
 
     Attributes:
-        given: inputs: all arrays of the reading, the reference, and dt [s], concatenated.
+        given: inputs of the step: all arrays of the reading, the reference, and dt [s],
+            concatenated.
         said: outputs of the estimator: all arrays of the estimate, concatenated.
         command: outputs of the controller: wheel speeds [rad/s].
     """
@@ -34,7 +35,7 @@ class Golden:
 
 
 def golden(loop: ControlLoop[eqx.Module]) -> Golden:
-    """Return steps in which every sensor has readings at some times and none at others."""
+    """Return reference steps; every sensor has readings in some of them and none in others."""
     run = jax.jit(lambda *inputs: loop_step(loop, *inputs))
     begin = loop.init()
     state, rows = (begin.estimator, begin.controller), []
@@ -66,9 +67,10 @@ def loop_step(
 
 
 def _inputs(loop: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
-    """Yield readings, references and time steps.
+    """Yield reading, reference and time step of every reference step.
 
-    Time steps include a short, a long and a zero one; readings include gaps, one of them long.
+    Among the time steps are a short one, a long one and 0. Readings have gaps, one of which lasts
+    longer than `Settings.stale_s`.
     """
     robot = loop.controller.robot
     angle = np.zeros(robot.wheels)

@@ -1,6 +1,6 @@
-"""The step of a control loop as StableHLO, for programs that run XLA without slipid.
+"""A step of a control loop as StableHLO, for programs that run XLA without slipid.
 
-`step.json` lists the input and output arrays in their order, with names, shapes and units.
+`step.json` lists the step's input and output arrays in their order, with names, shapes and units.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from slipid.support.errors import DataError
 
 SCHEMA = "slipid.stablehlo/1"
 TOLERANCE = 1e-9
-"""Largest difference between a number that the loaded program computes and the library's result,
-relative to the number's scale [1]."""
+"""Largest allowed difference between a number that the loaded program computes and the reference
+step, relative to the number's scale [1]."""
 PLATFORMS = ("cpu", "cuda", "tpu")
 """Platforms on which the programs run."""
 FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
@@ -42,8 +42,8 @@ class Signature:
 
     Attributes:
         state: arrays of the state, which are the first inputs and the first outputs.
-        given: all other inputs: readings, reference and dt.
-        said: all other outputs: estimate and command.
+        given: further inputs: readings, reference and dt.
+        said: further outputs: estimate and command.
     """
 
     state: tuple[Field, ...]
@@ -56,7 +56,7 @@ class Program:
     """An exported step that was loaded from its folder.
 
     Attributes:
-        signature: names and shapes of its arrays.
+        signature: names and shapes of the step's arrays.
         start: arrays of the state of a robot at rest at the pose 0, 0, 0.
         step: step of one robot.
         batch: step of many robots, with a leading axis on every array.
@@ -71,7 +71,8 @@ class Program:
 def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     """Return the content of the folder's files, keyed by name.
 
-    They are the step of one robot, the step of many robots, a description and reference steps.
+    The files are the step of one robot, the step of many robots, a description of the arrays,
+    reference steps and a README.
     """
     begin = loop.init()
     state = begin.estimator, begin.controller
@@ -108,7 +109,7 @@ def _signature(loop: ControlLoop[eqx.Module]) -> Signature:
         for struct in structs_of(loop)
     )
     about = "pose and rates in the world [m, m, rad and per s]"
-    reference, dt = Field("reference", "real", (6,), about), "since the last step [s]"
+    reference, dt = Field("reference", "real", (6,), about), "time since the last step [s]"
     command = Field("command", "real", (loop.controller.robot.wheels,), "wheel speeds [rad/s]")
     return Signature(
         state=(*estimator, *controller),
@@ -118,10 +119,10 @@ def _signature(loop: ControlLoop[eqx.Module]) -> Signature:
 
 
 def load_program(folder: Path | str) -> Program:
-    """Return the step in a folder, after checking that it reproduces the library's results.
+    """Return the step in a folder, after checking that it reproduces the reference steps.
 
     Raises:
-        DataError: a file is absent, damaged or of another version, or results differ.
+        DataError: a file is absent, damaged or of another version, or the results differ.
     """
     place = Path(folder)
     content = {}
@@ -135,7 +136,7 @@ def load_program(folder: Path | str) -> Program:
         schema = about.pop("schema")
         if schema != SCHEMA:
             raise DataError(
-                f"{place / 'step.json'}: its schema is {schema}, but this version of slipid reads "
+                f"{place / 'step.json'}: the schema is {schema}, but this version of slipid reads "
                 f"{SCHEMA}; update slipid, or export the robot again"
             )
         signature = typed(Signature, about)
@@ -145,7 +146,7 @@ def load_program(folder: Path | str) -> Program:
         steps = Golden(arrays["given"], arrays["said"], arrays["command"])
     except DataError:
         raise
-    except Exception as error:  # The parsers of three formats raise many kinds of errors.
+    except Exception as error:  # three parsers (JSON, npz, StableHLO) raise many kinds of errors
         raise DataError(f"{place}: damaged ({error}); export the robot again") from error
     program = Program(signature, tuple(start), *programs)
     _check_results(program, steps, place)
@@ -167,8 +168,8 @@ def _check_results(program: Program, steps: Golden, place: Path) -> None:
             gap = np.abs(numbers - np.concatenate([estimate, command]))
             if not (gap <= TOLERANCE * np.concatenate([scale, np.ones(len(command))])).all():
                 raise DataError(
-                    f"{place}: results of the program differ from those of the export by up to "
-                    f"{gap.max():.1e}; export the robot again"
+                    f"{place}: results of the program differ from the reference steps in "
+                    f"golden.npz by up to {gap.max():.1e}; export the robot again"
                 )
 
 

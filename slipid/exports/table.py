@@ -1,7 +1,7 @@
-"""The numbers of a robot as plain tables, for entering them into a controller by hand.
+"""Parameters, gains and limits of a robot as tables, for entering them into a controller by hand.
 
 `gains.md` is for reading and shows each value rounded and with all digits. `gains.csv` has the same
-rows with all digits; its lines that start with # are comments.
+rows with all digits; lines in it that start with # are comments.
 """
 
 import csv
@@ -33,7 +33,7 @@ _TITLES = {
     "forward": "Kinematics J: rim speed of a wheel [m/s] from the body twist",
     "inverse": "Pseudo-inverse of J: body twist from rim speeds [m/s]",
     "motor": "Motor, the same for all wheels",
-    "wheel_curve": "Slip ratio a + b |I| of each wheel, over all floors",
+    "wheel_curve": "Slip ratio a + b |I| of each wheel at a current I, fitted over all floors",
     "robot": "Wheels and body",
     "surface": "Floors",
 }
@@ -101,9 +101,8 @@ def _curve(robot: DeployedRobot) -> Iterator[NumberRow]:
 def _csv(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
     text = io.StringIO()
     for line in header(robot):
-        text.write(
-            f"# {line}".replace('"', "'") + "\n"
-        )  # a double quote would make readers join lines
+        # replace double quotes, which would make CSV readers join lines
+        text.write(f"# {line}".replace('"', "'") + "\n")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(HEAD)
     for x in lines:
@@ -114,7 +113,7 @@ def _csv(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
 
 
 def _markdown(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
-    text = ["# Numbers of a robot identified by slipid", "", *in_markdown(robot)]
+    text = ["# Parameters of a robot identified by slipid", "", *in_markdown(robot)]
     text += [gains_origin(robot), ""]
     for group, title in _TITLES.items():
         rows = []

@@ -1,4 +1,4 @@
-"""Text for people: words on one line, rounded numbers, Markdown tables, templates of files.
+"""Text for people: text on one line, rounded numbers, Markdown tables, templates of files.
 
 The module also converts names of floors and load set-ups to names that are valid for ROS
 parameters, C++ and files.
@@ -14,23 +14,23 @@ COMMENT_WIDTH = 96
 
 
 def one_line(text: str) -> str:
-    """Return text on one line, with unprintable characters replaced by spaces."""
+    """Return text on one line; unprintable characters and repeated spaces become one space."""
     shown = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(shown.split())
 
 
 def short(value: float) -> str:
-    """Return a number rounded to four digits, for people."""
+    """Return a number as text, rounded to four digits."""
     return f"{value:.4g}"
 
 
 def interval(ends: tuple[float, float] | None) -> str:
-    """Return an interval rounded to four digits, for people; empty text for None."""
+    """Return an interval as text, rounded to four digits; empty text for None."""
     return "" if ends is None else f"{short(ends[0])} to {short(ends[1])}"
 
 
 def wrapped(text: str, width: int = COMMENT_WIDTH) -> Iterator[str]:
-    """Yield a paragraph as lines of a comment; words such as paths and addresses stay whole."""
+    """Yield a paragraph as lines of at most `width` characters; longer words stay whole."""
     lines = textwrap.wrap(one_line(text), width, break_long_words=False, break_on_hyphens=False)
     yield from lines or [""]
 
@@ -47,7 +47,7 @@ def template(name: str) -> str:
 
 
 def filled(name: str, values: Mapping[str, str | Iterable[str]]) -> str:
-    """Return the text of a template with every @NAME@ replaced by its value, a text or lines."""
+    """Return a template's text with every @NAME@ replaced by its value, a text or several lines."""
     texts = {k: v if isinstance(v, str) else "\n".join(v) for k, v in values.items()}
     return re.sub(r"@([A-Z]+)@", lambda match: texts[match.group(1)], template(name))
 
@@ -69,14 +69,14 @@ register requires return short signed sizeof static struct switch template this 
 typedef typeid typename union unsigned using virtual void volatile while xor
 """
 _KEYWORDS = frozenset(_WORDS.split())
-"""Keywords of C++, which fields of a generated struct cannot have as names."""
+"""Keywords of C++, which cannot be names of fields in a generated struct."""
 
 
 def identifiers(labels: Sequence[str], kind: str) -> tuple[str, ...]:
     """Return a unique name of small letters, digits and single underscores for each label.
 
-    The names differ even without underscores, which generated structs omit. `kind` is put before a
-    label that is not a valid name by itself.
+    The names differ even without underscores, since generate_parameter_library omits underscores in
+    the names of structs. `kind` is put before a label that is not a valid name by itself.
     """
     names: list[str] = []
     for label in labels:

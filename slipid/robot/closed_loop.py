@@ -134,7 +134,8 @@ class ClosedLoopRun:
 
 
 _step = eqx.filter_jit(ControlLoop.step)
-"""Compiled step that takes all numbers as arguments; loops of equal structure share its code."""
+"""Compiled step with all parameters and settings as arguments, so that loops of equal structure
+share the code."""
 
 
 def run_closed_loop(

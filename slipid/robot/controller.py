@@ -71,10 +71,10 @@ class Gains(eqx.Module):
 
     @classmethod
     def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
-        """Return the gains tuned for a robot and its load set-up if they beat those set by hand.
+        """Return a robot's tuned gains if they are better than the gains set by hand.
 
         With `forced`, tuned gains are returned even if they are no better. Otherwise, and also if
-        the record has no tuned gains for this load set-up, the gains set by hand are returned.
+        there are no tuned gains for the robot's load set-up, the gains set by hand are returned.
 
         Raises:
             ValueError: the robot consists of arrays without a record.
@@ -188,8 +188,7 @@ class Controller(eqx.Module):
 
     Attributes:
         robot: identified robot.
-        gains: gains; by default those tuned for the robot if they are better than those set by
-            hand.
+        gains: gains; by default those that `Gains.of` returns for the robot.
         limits: limits of the command.
         correction: torque correction of the 2021 paper: "paper_print" as printed in the paper,
             "paper_code" as in the authors' program, "torque" with the errors of both corrected, or

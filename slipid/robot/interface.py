@@ -31,7 +31,7 @@ Scalar = Float[Array, ""] | float
 
 
 def as_arrays(given: Some) -> Some:
-    """Return the module with its numbers as arrays, so that compiled code accepts any values."""
+    """Return a module with arrays instead of floats, so that compiled code accepts any values."""
     return jax.tree.map(partial(jnp.asarray, dtype=float), given)
 
 
@@ -144,7 +144,7 @@ class Measurement(eqx.Module):
     fix_age: Given = None
 
     def filled(self, drives: int) -> Readings:
-        """Return the same readings with NaN for all absent ones.
+        """Return the same measurement with NaN for all absent readings.
 
         Raises:
             ValueError: a field does not have the shape for this number of drives.

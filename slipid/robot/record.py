@@ -126,8 +126,8 @@ class FloorRecord:
 class EffectRecord:
     """Effect table of a load set-up: effects estimated from the fitted runs.
 
-    Its arrays are indexed by floor, speed and direction of travel. Directions are those of the
-    motion relative to the body, evenly spaced counter-clockwise from straight ahead.
+    Its arrays are indexed by floor, speed and direction of travel. The direction is relative to the
+    body; directions are evenly spaced counter-clockwise from straight ahead.
 
     Attributes:
         speeds: speeds of the rows, rising.
@@ -258,8 +258,8 @@ class RobotRecord:
         source: method that the parameters come from.
         wheels: arrangement of the wheels.
         parameters: parameters of the robot, keyed by path such as `robot.mass`.
-        floors: floors in the order of the arrays.
-        loads: load set-ups in the order of the arrays.
+        floors: floors, in the order of all arrays with an element per floor.
+        loads: load set-ups, the default one first.
         current_trend: a and b of the excess a + b v of measured over modelled currents at a body
             speed v.
         highest_speed: highest wheel speed of the fitted runs.

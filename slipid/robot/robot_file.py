@@ -157,7 +157,9 @@ def _content(path: Path) -> dict[str, object]:
         )
     except OSError as error:
         reason = error.strerror or str(error)
-        raise DataError(f"{path}: {reason}; expected a robot.json of `slipid identify`") from error
+        raise DataError(
+            f"{path}: {reason}; expected a robot.json that `slipid identify` wrote"
+        ) from error
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: not valid JSON ({error}); {REWRITE_HINT}") from error
     schema = content.get("schema") if isinstance(content, dict) else None
@@ -302,7 +304,7 @@ def _sized(where: str, value: Numbers, size: int) -> None:
 
 
 def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> None:
-    """Raise `ValueError` for a value of another size, or one that breaks a declared rule."""
+    """Raise `ValueError` if a value has a wrong size or breaks a rule of its declaration."""
     _sized(where, value, size)
     if rule := declaration.broken_rule(np.asarray(value)):
         raise ValueError(f"{where} = {value}: expected {rule}")

@@ -99,5 +99,5 @@ def test_a_drive_on_a_map_of_ones_own_is_on_that_map(fit, tmp_path):
     seen = found.run.estimate.surface_probability[-1]
     assert seen[:, robot.labels.index("gray")].min() > 0.8
     there.write_text(there.read_text().replace("gray", "ice"))
-    with pytest.raises(sl.DataError, match=r"lab\.toml: no surface 'ice'; identified"):
+    with pytest.raises(sl.DataError, match=r"lab\.toml: surface 'ice' was not identified"):
         sl.drive(robot, "contact_map", map=there)

@@ -588,7 +588,7 @@ def test_export_writes_a_folder_and_detects_a_changed_byte(small, tmp_path):
     words = ("export", out / "robot.json", "--to", "table", "--out", out, "--quiet")
     refused = invoke(*words)
     assert refused.exit_code == 2
-    assert "gains.csv: changed since it was written, and would be overwritten" in refused.output
+    assert "gains.csv: changed since it was exported, and would be overwritten" in refused.output
     path.write_bytes(written)
     again = invoke(*words)
     assert again.exit_code == 0, again.output

@@ -131,7 +131,5 @@ def older_gains() -> dict[str, object]:
 
 
 def test_a_folder_without_a_robot_says_what_to_run(tmp_path):
-    with pytest.raises(
-        DataError, match=r"robot\.json: missing; it is written by `slipid identify`"
-    ):
+    with pytest.raises(DataError, match=r"robot\.json: missing; write it by `slipid identify`"):
         read_robot(tmp_path)

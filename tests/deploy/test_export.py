@@ -171,7 +171,7 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
         (ExportOptions(()), "no form"),
         (ExportOptions(controller="contacts"), "no controller 'contacts', did you mean contact"),
         (ExportOptions(controller="contact_map"), "needs a map of the floors"),
-        (ExportOptions(map=Path("site.toml")), "uses no map; omit --map"),
+        (ExportOptions(map=Path("site.toml")), "does not use a map; omit --map"),
         (ExportOptions(path="square"), "no path 'square'"),
         (ExportOptions(speed=9.0), "speed 9 m/s"),
     ],
@@ -186,5 +186,5 @@ def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, 
     (tmp_path / "mine.txt").write_text("kept")
     made = "slipid.deploy.export.control_loop_of"
     monkeypatch.setattr(made, lambda *_, **__: pytest.fail("made"))
-    with pytest.raises(DataError, match="files that are not from an export"):
+    with pytest.raises(DataError, match="files that an export did not write"):
         export(ROBOT, tmp_path, ExportOptions(), QUIET)

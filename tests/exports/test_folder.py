@@ -36,7 +36,7 @@ def test_a_changed_byte_is_reported_with_its_file(folder, name):
 
 def test_added_and_lost_files_are_reported(folder):
     (folder / "c/src/more.c").write_text("int y;\n")
-    with pytest.raises(DataError, match=r"more\.c: added after the folder was written"):
+    with pytest.raises(DataError, match=r"more\.c: added after the export"):
         check_folder(folder)
     (folder / "c/src/slipid.c").unlink()
     with pytest.raises(DataError, match=r"slipid\.c: No such file"):
@@ -46,10 +46,10 @@ def test_added_and_lost_files_are_reported(folder):
 @pytest.mark.parametrize("sums", [b"", b"no digest here\n", b"\xff\xfe"])
 def test_a_folder_without_its_checksums_is_none(folder, sums):
     (folder / SUMS).write_bytes(sums)
-    with pytest.raises(DataError, match="expected a folder written by `slipid export`"):
+    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
         check_folder(folder)
     (folder / SUMS).unlink()
-    with pytest.raises(DataError, match="expected a folder written by `slipid export`"):
+    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
         check_folder(folder)
 
 
@@ -58,7 +58,7 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(folder):
     outside.write_bytes(b"")
     digest = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     (folder / SUMS).write_text(f"{digest}  ../other\n")
-    with pytest.raises(DataError, match="expected a folder written by `slipid export`"):
+    with pytest.raises(DataError, match="expected a folder that `slipid export` wrote"):
         check_folder(folder)
     with pytest.raises(DataError):
         write_folder(folder, CONTENT)
@@ -90,7 +90,7 @@ def test_what_is_built_of_it_is_no_part_of_it(folder):
 
 def test_a_file_that_was_changed_by_hand_is_never_lost(folder):
     (folder / "c/src/slipid.c").write_text("int own;\n")
-    with pytest.raises(DataError, match=r"slipid\.c: changed since it was written"):
+    with pytest.raises(DataError, match=r"slipid\.c: changed since it was exported"):
         write_folder(folder, CONTENT)
     assert (folder / "c/src/slipid.c").read_text() == "int own;\n"
     assert (folder / "README.md").exists()
@@ -118,19 +118,19 @@ def test_a_folder_that_was_cut_short_can_be_written_again(folder, monkeypatch):
 def test_what_a_killed_process_left_is_cleared(folder):
     for name in ("c/src/.slipid.c.0123abcd", f".{SUMS}.89abcdef"):
         (folder / name).write_text("a par")
-    with pytest.raises(DataError, match="added after the folder was written"):
+    with pytest.raises(DataError, match="added after the export"):
         check_folder(folder)
     write_folder(folder, CONTENT)
     assert sorted(check_folder(folder)) == sorted(CONTENT)
     (folder / ".mine.0123abcd").write_text("kept")
-    with pytest.raises(DataError, match="files that are not from an export"):
+    with pytest.raises(DataError, match="files that an export did not write"):
         write_folder(folder, CONTENT)
     assert (folder / ".mine.0123abcd").read_text() == "kept"
 
 
 def test_other_files_are_never_touched(folder):
     (folder / "mine.txt").write_text("kept")
-    with pytest.raises(DataError, match=r"files that are not from an export \(mine.txt\)"):
+    with pytest.raises(DataError, match=r"files that an export did not write \(mine.txt\)"):
         write_folder(folder, CONTENT)
     assert (folder / "mine.txt").read_text() == "kept"
     assert (folder / "README.md").read_bytes() == CONTENT["README.md"]

@@ -99,7 +99,7 @@ def test_controllers_turn_wheels_as_the_robot_has_them(name):
             assert speed * sign == pytest.approx(wanted[wheel], abs=1e-9), joint
     assert len(set(joints(p))) == robot.wheels
     assert f"type: {controller}/" in files["README.md"]
-    assert "Its kinematics are the identified ones." in files["README.md"]
+    assert "The kinematics of this controller are the identified kinematics." in files["README.md"]
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_deviating_drives_are_averaged_and_reported(robot, files):
     p = parameters(files, "drive_controller.yaml", OMNI)
     mean = np.mean(robot.record.parameters["robot.drive_offset"].value)
     assert p["wheel_offset"] == pytest.approx(np.radians(60) + mean, abs=1e-12)
-    assert "Its kinematics differ from the identified ones by 0.1778 %" in files["README.md"]
+    assert "differ from the identified kinematics by at most 0.1778 %" in files["README.md"]
 
 
 @pytest.mark.slow

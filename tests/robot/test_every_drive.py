@@ -129,7 +129,7 @@ def test_it_has_no_controller(driven, tmp_path):
     robot, _ = driven
     assert not robot.steers
     robot.save(tmp_path / "robot.json")
-    with pytest.raises(DataError, match=r"it has an estimator .* but no controller"):
+    with pytest.raises(DataError, match=r"the robot has an estimator .* but no controller"):
         read_robot(tmp_path)
-    with pytest.raises(ValueError, match=r"it has an estimator .* but no controller"):
+    with pytest.raises(ValueError, match=r"the robot has an estimator .* but no controller"):
         drive(robot)

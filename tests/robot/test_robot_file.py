@@ -210,7 +210,7 @@ def refused(path: Path) -> str:
 def test_what_is_no_robot_is_refused(tmp_path):
     path = tmp_path / "robot.json"
     assert "No such file" in refused(path)
-    assert "expected a robot.json of `slipid identify`" in refused(path)
+    assert "expected a robot.json that `slipid identify` wrote" in refused(path)
     assert "irectory" in refused(tmp_path)
     for text in ("", "{", '{"a": NaN}', '{"a": 1, "a": 2}', "[" * 100_000, '{"a": 1e}'):
         path.write_text(text)

@@ -55,7 +55,7 @@ def lens_from_pictures(words: Sequence[str], board: Board, k3: bool) -> Calibrat
     Args:
         words: files, folders and glob patterns of images.
         board: the board.
-        k3: whether the distortion parameter k3 is fitted too.
+        k3: True to fit the distortion parameter k3 as well.
 
     Raises:
         DataError: a file is not an image, or the views do not determine a lens.

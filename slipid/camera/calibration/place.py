@@ -135,9 +135,9 @@ def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit
 
 
 def _bad_point(lens: Lens, points: FloorPoints) -> tuple[int, str] | None:
-    """Return index of the point without which the others agree far better, with a sentence on it.
+    """Return the index of a point that clearly contradicts all others, and a sentence about it.
 
-    The result is None if there is no such point.
+    Without this point the others agree far better. The result is None if there is no such point.
     """
     fit = _fitted(lens, points)
     without = [_fitted(lens, points.without(k)) for k in range(len(points.names))]
@@ -145,8 +145,8 @@ def _bad_point(lens: Lens, points: FloorPoints) -> tuple[int, str] | None:
     if not agreed:
         return None
     error, index, rest = min(agreed, key=lambda one: one[:2])
-    # without a fit to all points (one may be so far off that no camera pose explains them all),
-    # the rest must be accurate by itself
+    # one point may be so far off that no camera pose explains all points: there is no error to
+    # compare with then, and the fit without the point must be accurate in itself
     limit = LEAST_BAD_PX if fit is None else AGREEMENT * fit.rms_px
     one = replace(rest, points=points.only([index]))
     if not (error < limit and one.rms_px > LEAST_BAD_PX):

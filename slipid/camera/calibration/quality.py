@@ -43,7 +43,7 @@ class Coverage:
     """Coverage of the image by corners of the board.
 
     Attributes:
-        visited: cells of the image that contain corners, beginning at the upper left.
+        visited: mask of the image's cells that contain corners, beginning at the upper left.
         reach: how near board corners come to each of the image's four corners, as a fraction of
             the distance from the image's middle; the smallest of the four values [1].
     """

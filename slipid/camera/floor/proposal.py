@@ -35,8 +35,8 @@ small, since users can easily give two proposed surfaces the same name, but not 
 LEAST_PART = 0.002
 """Fraction of the floor below which a patch is too small to propose a surface [1]."""
 LIGHTNESS_WEIGHT = 0.8
-"""Weight of a difference of lightness relative to one of a or b [1]; it is below 1 since shading
-changes lightness."""
+"""Weight of a difference in lightness, relative to a difference in a or b [1]; it is below 1 since
+shading changes lightness."""
 TEXTURE_WEIGHT = 10.0
 """Colour distance [CIELAB units] that counts as much as a difference of 1 in texture."""
 ABOUT_SAMPLES = 4000

@@ -233,7 +233,7 @@ def labelled(costs: Costs, visible: Mask) -> Labels:
 
 
 def smoothed(costs: Costs, visible: Mask) -> Labels:
-    """Return labels of low cost that agree with those of neighbouring cells.
+    """Return labels that have a low cost and agree with the labels of neighbouring cells.
 
     The method is the mean-field approximation of a Potts model: each cell has a probability for
     every surface, and the more probable a surface is in neighbouring cells, the lower its cost in

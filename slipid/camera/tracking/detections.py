@@ -117,7 +117,7 @@ def detect_all(
 
 
 def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
-    """Return advice if an image shows markers, but none of the tracked ones; None otherwise."""
+    """Return advice if an image shows markers but no tracked marker; None otherwise."""
     wanted = ", ".join(map(str, sorted(tracker.ids)))
     visible = {d.id for d in tracker.detector.detect(grey, tracker.region)}
     if others := sorted(visible - tracker.ids):

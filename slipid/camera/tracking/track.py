@@ -169,7 +169,7 @@ class Flag(IntEnum):
         AMBIGUOUS: a marker was detected twice.
         REPEATED: the image is identical to that of the frame before.
         SHAPE: the corners do not have the shape of a marker of the given size.
-        JUMP: no body could drive through this pose and those of other frames.
+        JUMP: no body could drive through this pose and the poses of other frames.
     """
 
     OK = 0

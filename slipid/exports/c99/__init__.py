@@ -1,1 +1,1 @@
-"""C99 code generated from functions that JAX has traced."""
+"""Generation of C99 code from functions that JAX has traced."""

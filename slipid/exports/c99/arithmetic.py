@@ -1,8 +1,8 @@
-"""Rules that convert arithmetic primitives of JAX to C: element-wise, reductions, products.
+"""Rules that convert arithmetic primitives of JAX to C: element-wise, reductions, matrix products.
 
-A product with a constant 0 is omitted from a sum of products. The result is the same for finite
-numbers, but infinity or NaN times such a 0 counts as 0, where JAX gives NaN. The words lane, row
-and cell are defined in `slipid.exports.c99.ir`.
+A product with a constant 0 is omitted from a sum of products. For finite numbers this does not
+change the result, but infinity or NaN times such a constant counts as 0, where JAX gives NaN. The
+words lane, row and cell are defined in `slipid.exports.c99.ir`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[Builder, tuple[Cell, ...], int], Cell | None]
 """Function that simplifies an operation, given its operands and the number of lanes of the result.
 
-It returns a cell that equals the result, such as an operand; None if nothing can be simplified."""
+It returns a cell that equals the result, such as one of the operands; None if the operation cannot
+be simplified."""
 
 
 UNARY = {
@@ -72,8 +73,9 @@ BINARY = {
 INTEGER_TEMPLATES = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
 """Templates of operations whose C expression differs for integers."""
 NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (None, 1.0)}
-"""Neutral elements of each operation: the value of the first operand, and that of the second one,
-with which the result equals the other operand; None if there is no such value."""
+"""Neutral elements of each operation: a value of the first operand with which the result equals the
+second, and a value of the second operand with which the result equals the first; None if there is
+no such value."""
 
 
 def applied(
@@ -98,8 +100,9 @@ def applied(
 def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
     """Return the axis of the lanes of an element-wise result.
 
-    It is the axis of the first value with lanes whose lanes are not broadcast. Without such a value
-    it is the longest axis of a result of more than `MOST_UNROLLED` elements, else None.
+    It is the lane axis of the first operand that has lanes and is not broadcast along them. Without
+    such an operand it is the longest axis of a result with more than `MOST_UNROLLED` elements; a
+    smaller result has no lanes, and None is returned.
     """
     for value in values:
         axis = axis_of(value)
@@ -109,7 +112,7 @@ def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
 
 
 def unary(name: str) -> Rule:
-    """Return the rule of a function of one operand."""
+    """Return the rule of a primitive with one operand."""
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         if UNARY[name] == "{0}":
@@ -122,7 +125,7 @@ def unary(name: str) -> Rule:
 
 
 def binary(name: str) -> Rule:
-    """Return the rule of a function of two operands; tanh(a) / b becomes one call."""
+    """Return the rule of a primitive with two operands; tanh(a) / b becomes a single call."""
     first, second = NEUTRAL.get(name.removesuffix("_any"), (None, None))
 
     def simpler(builder: Builder, cells: tuple[Cell, ...], lanes: int) -> Cell | None:
@@ -147,7 +150,7 @@ def integer_pow(builder: Builder, values: list[Value], params: Params, out: Shap
     """Return an array raised to an integer power by repeated multiplication."""
     power = params["y"]
     if power == 0:
-        raise NoFormError("a power of 0")
+        raise NoFormError("an exponent of 0")
     product = " * ".join(["{0}"] * abs(power))
     template = product if power > 0 else f"R(1.0) / ({product})"
     return applied(builder, template, kind_of(out.dtype), values, out.shape)
@@ -172,7 +175,7 @@ def converted(builder: Builder, values: list[Value], params: Params, out: Shaped
 
 
 def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Choose between two arrays element by element: the second one where a condition is true."""
+    """Choose between two arrays element by element: the second array where a condition is true."""
 
     def simpler(builder: Builder, cells: tuple[Cell, ...], lanes: int) -> Cell | None:
         which, no, yes = cells
@@ -194,7 +197,8 @@ REDUCED: dict[str, tuple[str, str, str | None]] = {
     "reduce_and": ("{0} & {1}", "true", None),
     "reduce_or": ("{0} | {1}", "false", None),
 }
-"""Template of each reduction, and its initial value for reals or truth values and for integers."""
+"""For each reduction: its template, its initial value for real numbers or truth values, and its
+initial value for integers."""
 
 
 def reduced(name: str) -> Rule:
@@ -232,7 +236,7 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     """Return the index of the smallest element, or of the first NaN if there is one."""
     value = values[0]
     if len(value.shape) > 1 or kind_of_value(value) != "real":
-        raise NoFormError("an argmin of other than one axis of reals")
+        raise NoFormError("only for an array of real numbers with one axis")
     cell, lanes = along(builder, value, value.shape, 0).item(), value.shape[0]
     least = builder.compute("real", "r_min({acc}, {0})", (cell,), lanes, "R_INFINITY")
     which = At(builder.names.table(np.arange(lanes), "int"), 0, 1)
@@ -242,7 +246,7 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
 
 
 def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return sums of products of two arrays, as `dot_general` of JAX defines them."""
+    """Return the product of two arrays that `dot_general` of JAX computes."""
     summed, batch = params["dimension_numbers"]
     free = [
         [d for d in range(len(v.shape)) if d not in (*summed[k], *batch[k])]
@@ -273,7 +277,8 @@ def _ordered(
 ) -> Cells:
     """Transpose cells to the order of axes in `order`, and merge each group of axes into one.
 
-    Axes are counted in `shape`, the array's; `axis`, the axis of the lanes, is absent in cells.
+    Axes are those of the array, whose shape is `shape`. The cells lack `axis`, the axis of the
+    lanes.
     """
     dims = [d for d in range(len(shape)) if d != axis]
     groups = [[d for d in part if d != axis] for part in order]
@@ -287,10 +292,10 @@ def _lane_axes(
     batch: Sequence[Sequence[int]],
     free: Sequence[Sequence[int]],
 ) -> tuple[int | None, int | None]:
-    """Return the axis along which a product loops, in its left and in its right array.
+    """Return the axis along which a product loops, as an axis of the left and of the right array.
 
-    It is the axis of lanes of one of the two; None for an array that lacks this axis, and for both
-    if neither array has lanes.
+    The loop runs along the lanes of one of the arrays. The result is None for an array without a
+    corresponding axis, and for both arrays if neither has lanes.
     """
     left, right = map(axis_of, values)
     if right in free[1]:

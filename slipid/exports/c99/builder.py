@@ -1,9 +1,9 @@
-"""Builder that places each statement of a function in a block of code.
+"""Builder that appends each statement of a function to a block of code.
 
-Every expression is computed once, in the earliest block that has its inputs. A block is
+Every expression is computed once, in the earliest block in which its inputs are known. A block is
 straight-line code or one loop over lanes (the elements along one axis of an array), so that many
-operations on arrays of one length share one loop. Expressions that are the same in all iterations
-of a repetition are computed before it.
+operations on arrays of the same length share one loop. Expressions that are the same in all
+iterations of a repetition are computed before it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from slipid.exports.c99.ir import (
 from slipid.exports.fields import DTYPES, Kind
 
 CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
-"""Beginnings of calls of C's library, which prevent a compiler from vectorizing a loop."""
+"""Functions of C's library, whose calls prevent a compiler from vectorizing a loop."""
 
 
 class Names:
@@ -39,7 +39,7 @@ class Names:
         return self._last
 
     def table(self, values: np.ndarray, kind: Kind) -> Memory:
-        """Return a table of these constants, shared with earlier requests for equal constants."""
+        """Return a table of these constants, the earlier table if equal constants have one."""
         flat = np.ascontiguousarray(values.reshape(-1), dtype=DTYPES[kind])
         key = (kind, flat.tobytes())
         if key not in self.tables:
@@ -52,12 +52,12 @@ class Builder:
     """Collector of the statements of a function, or of the body of a condition or repetition.
 
     Attributes:
-        parent: builder of the code around it.
-        turns: block that repeats this code; None outside of repetitions.
+        parent: builder of the surrounding code; None for the body of a function.
+        turns: block that repeats this builder's code; None outside of repetitions.
         blocks: blocks in order of execution.
-        source: file and line of the Python code that the next statement is generated from.
-        contiguous: arrays that are also stored in row-major order, with that memory, keyed by the
-            `id` of their cells.
+        source: file and line of the Python code from which the next statement is generated.
+        contiguous: arrays that were also stored in row-major order, with the memory that holds
+            them, keyed by the `id` of their cells.
     """
 
     def __init__(self, names: Names, parent: Builder | None = None):
@@ -81,8 +81,9 @@ class Builder:
         Args:
             kind: kind of the number.
             template: C expression with the placeholders {0}, {1}, ... for the cells.
-            cells: cells for these placeholders.
-            lanes: number of lanes; ignored if no cell varies over the lanes and nothing is reduced.
+            cells: cells for the placeholders.
+            lanes: number of lanes; it is ignored if no cell varies over the lanes, except in a
+                reduction.
             start: initial value of a reduction over the lanes to one number; empty for none.
         """
         lanes = lanes if start or any(map(varies, cells)) else 0
@@ -104,12 +105,15 @@ class Builder:
         return self._known[key]
 
     def array(self, kind: Kind, size: int, cells: tuple[Cell, ...], lanes: int = 0) -> Memory:
-        """Return new memory, placed in the earliest block in which `cells` are available."""
+        """Return new memory, to be written in the earliest block in which `cells` are known."""
         home = self._outermost(cells)._place(cells, lanes)
         return Memory(f"m{self.names.number()}", kind, size, home)
 
     def fill(self, memory: Memory, template: str, cell: Cell, times: int = 0) -> None:
-        """Append a C statement that writes to memory from `array`, looping if `times` is not 0."""
+        """Append a C statement that writes `cell` to memory of `array`.
+
+        If `times` is not 0, the statement is in a loop with that number of iterations.
+        """
         block = memory.home
         assert block is not None
         block.statements.append(
@@ -117,16 +121,16 @@ class Builder:
         )
 
     def append(self, block: CodeBlock) -> CodeBlock:
-        """Append a block after all others, and return it."""
+        """Append a block at the end, and return it."""
         block.place = len(self.blocks)
         self.blocks.append(block)
         return block
 
     def _outermost(self, cells: tuple[Cell, ...]) -> Builder:
-        """Return the builder for a statement that reads these cells.
+        """Return the builder to which a statement that reads `cells` belongs.
 
-        It is the innermost one whose repetition changes any of the cells, so that the statement is
-        moved out of all other repetitions.
+        It is the innermost builder whose repetition changes any of the cells, so that the statement
+        is moved out of repetitions that do not change its result.
         """
         if self.parent is None or self.turns is None or any(map(self._changes, cells)):
             return self
@@ -141,9 +145,10 @@ class Builder:
         return isinstance(cell, Variable) and cell.home.owner is self
 
     def _place(self, cells: tuple[Cell, ...], lanes: int, calls: bool = False) -> CodeBlock:
-        """Return the earliest block for a statement with this number of lanes and these cells.
+        """Return the earliest block for a statement with these cells and number of lanes.
 
-        Loops with calls or reductions are separate from loops that a compiler can vectorize.
+        `calls` is True for calls of C's library and reductions, which get loops of their own, so
+        that a compiler can vectorize the other loops.
         """
         apart = calls and lanes > 0
         first = max((self._first_block(cell, lanes) for cell in cells), default=0)
@@ -162,6 +167,10 @@ class Builder:
         return self._next_to(cell.home, lanes == cell.lanes)
 
     def _next_to(self, home: CodeBlock | None, together: bool) -> int:
+        """Return the index of the first block that can use values of the block `home`.
+
+        It is `home` itself if `together`, else the block after it.
+        """
         if home is None or home.owner is not self:
-            return 0  # The memory is filled before the code of this builder begins.
+            return 0  # the values exist before the code of this builder begins
         return home.place + (0 if together else 1)

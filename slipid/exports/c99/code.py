@@ -1,4 +1,4 @@
-"""Header and source of a control loop in C99, generated from the JAX functions of the library."""
+"""Header and source of a control loop in C99, generated from slipid's own JAX functions."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Code:
     """The C code of a control loop, and of a path that it follows.
 
     Attributes:
-        robot: robot with the record of its numbers.
+        robot: robot with the record of its parameters.
         loop: estimator and controller.
-        path: path for a robot that starts at the origin.
+        path: path that `slipid_follow` follows.
         estimator: struct of the estimator's state.
         controller: struct of the controller's state.
         reading: struct of the inputs.
@@ -40,10 +40,10 @@ class Code:
     """
 
     def __init__(self, robot: DeployedRobot, loop: ControlLoop[eqx.Module], path: Path):
-        """Trace and lower all functions.
+        """Trace all functions and convert them to C.
 
         Raises:
-            UnsupportedError: a step uses a primitive without a form in C.
+            UnsupportedError: a step uses a primitive that has no form in C.
         """
         self.robot, self.loop, self.path = robot, loop, path
         self._names = Names()
@@ -85,12 +85,12 @@ class Code:
 
     @property
     def kept(self) -> int:
-        """Size of the states of estimator, controller and path, counted in numbers."""
+        """Total size of the states of estimator, controller and path [numbers]."""
         return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
 
     @property
     def scratch(self) -> int:
-        """Largest total size of a function's arrays on the stack, counted in numbers."""
+        """Largest total size of a function's arrays on the stack [numbers]."""
         return max(f.scratch for f in self.functions)
 
     def header(self) -> str:
@@ -110,9 +110,10 @@ class Code:
             "DEFINES": [f"#define {d}" for d in defines],
             "ABOUT": [line for part in about(self.loop) for line in _comment(part)],
             "FOLLOWABOUT": _comment(
-                "Own time of the path [s], from 0, and the reference there, for a robot at a pose. "
-                f"The path begins at {begin} [m, m, rad] and lasts {self.path.duration:g} s; it "
-                "waits for a robot that lags."
+                "Advance the time of the path [s], which begins at 0, and return the reference at "
+                "the new time, for a robot at a pose. "
+                f"The path begins at {begin} [m, m, rad] and lasts {self.path.duration:g} s; its "
+                "time waits for a robot that lags."
             ),
             **{s.name.upper(): _definition(s) for s in self.structs},
             **{
@@ -136,11 +137,11 @@ class Code:
 
 
 def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
-    """Yield sentences about axes, wheels, sensors and floors, for readers of the header."""
+    """Yield sentences about axes, wheels, sensors and floors, for comments in slipid.h."""
     robot = loop.controller.robot
     yield (
-        "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those "
-        "of the start pose. A twist is in the body's axes."
+        "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: the axes "
+        "in which the start pose is given. A twist is in the body's axes."
     )
     rows = zip(robot.places.tolist(), robot.forward.tolist(), strict=True)
     for k, ((x, y), row) in enumerate(rows):

@@ -22,13 +22,13 @@ FILLED_FILES = (
     *("test/golden.h", "test/check.c", "examples/drive/drive.c", "examples/Slipid/Slipid.ino"),
     *("CMakeLists.txt", "library.json", "library.properties", "README.md"),
 )
-"""Files, besides the code itself, that are written from the template of the same name."""
+"""Files besides slipid.h and slipid.c, each written from the template with the same file name."""
 
 
 def _golden(code: Code) -> dict[str, str | list[str]]:
     """Return the texts for the template of golden.h, keyed by their placeholders.
 
-    They are the reference steps as tables, and C code that writes and reads the structs.
+    The texts are the reference steps as tables, and C code that writes and reads the structs.
     """
     steps = golden(code.loop)
     names = [f.name for f in code.estimate.fields for _ in range(f.size)]
@@ -72,14 +72,14 @@ def _reading_out(struct: Struct) -> list[str]:
 
 @dataclass(frozen=True)
 class Recording:
-    """A closed-loop run of the library along a path, one row per control period.
+    """A closed-loop run along a path with slipid's own control loop, one row per control period.
 
     Attributes:
         plant: description of the plant.
         start: pose at which the run began [m, m, rad].
         given: inputs of each step: dt [s] and all arrays of the reading, concatenated.
         command: commanded wheel speeds [rad/s].
-        time: time along the path, which waits for a robot that lags [s].
+        time: time of the path [s], which waits for a robot that lags.
     """
 
     plant: str
@@ -96,7 +96,7 @@ class Recording:
 
     @property
     def commands(self) -> str:
-        """Text of commands.txt, as the example prints it."""
+        """Text of commands.txt, which the output of the example must equal."""
         rows = zip(self.command, self.time, strict=True)
         return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.9f}\n" for c, t in rows)
 
@@ -110,10 +110,11 @@ def c_files(
     """Return the text of each file, keyed by its path in the folder.
 
     Args:
-        robot: robot with the record of its numbers.
+        robot: robot with the record of its parameters.
         loop: estimator and controller.
         path: path that the example follows.
-        recording: closed-loop run along the path, whose commands the example must reproduce.
+        recording: closed-loop run along the path, whose commands the example must reproduce; None
+            to omit it.
 
     Raises:
         UnsupportedError: a step uses a primitive that has no form in C.

@@ -1,4 +1,4 @@
-"""Translation of a traced function to a C function with arguments, body and memory."""
+"""Translation of a traced JAX function to a C function with arguments, body and stack arrays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class Argument:
 
     Attributes:
         name: name of the argument.
-        struct: struct that the argument points to; one without a name for plain numbers.
+        struct: struct that the argument points to; for plain numbers, a struct without a name and
+            with a single field.
         read: True if the function reads the argument.
         written: True if the function writes the argument.
     """
@@ -42,12 +43,12 @@ class Argument:
 
     @property
     def made(self) -> Argument:
-        """The same argument for a function that writes it without reading it."""
+        """The same argument for a function that only writes it."""
         return replace(self, read=False, written=True)
 
     @property
     def changed(self) -> Argument:
-        """The same argument for a function that both reads and writes it."""
+        """The same argument for a function that reads and writes it."""
         return replace(self, written=True)
 
     @property
@@ -79,9 +80,9 @@ class Function:
     Attributes:
         name: name of the function.
         arguments: arguments in order.
-        lines: lines of its body.
-        reads: names of all memory that it reads.
-        scratch: total size of its arrays on the stack, counted in numbers.
+        lines: lines of the function's body.
+        reads: names of all memory that the function reads.
+        scratch: total size of the function's arrays on the stack [numbers].
     """
 
     name: str
@@ -110,8 +111,8 @@ def function(
         names: unique names and constant tables of the generated file.
         name: name of the C function.
         arguments: arguments of the C function in order.
-        run: function of JAX. Its inputs are the trees of all arguments that are read, and its
-            results the trees of all arguments that are written, both in the arguments' order.
+        run: function of JAX. Its inputs are the structs' trees of all arguments that are read, and
+            its results the trees of all arguments that are written, in the arguments' order.
 
     Raises:
         UnsupportedError: the function uses a primitive without a rule.
@@ -140,7 +141,7 @@ def function(
 
 
 def traced(run: Callable[..., object], *like: object) -> Traced:
-    """Trace a function of trees as a function of their leaves, which returns leaves.
+    """Trace a function of trees as a function from the arguments' leaves to the result's leaves.
 
     `like` are example arguments.
     """

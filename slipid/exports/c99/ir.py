@@ -1,14 +1,16 @@
 """Intermediate representation of a traced function: arrays of cells, statements, and their blocks.
 
 Words of the code generator:
-    lane: element along the one axis of a long array over which the C code loops, with index `l`.
-    row: all elements of an array along an axis, one per lane.
-    cell: what a C expression refers to: one number, or a row of numbers in a loop over lanes. An
-        array is a numpy array of cells; its axis of lanes is absent there, and all other axes are
+    lane: one iteration, with index `l`, of a C loop along an axis of a long array (the axis of its
+        lanes); also the array element that belongs to the iteration.
+    row: all elements of an array along the axis of its lanes, one per lane.
+    cell: what a C expression refers to: a single number, or a row of numbers in a loop over lanes.
+        An array is a numpy array of cells, without the axis of its lanes. All other axes are
         unrolled, so that slicing or transposing an array costs no time on the robot.
     memory: named storage in C: a struct field, an array on the stack or a table of constants.
     source: array whose elements are rearranged into a new array.
-    place: index of an element in some sources, each flattened in row-major order, concatenated.
+    place: index of an element in the concatenation of all sources, each flattened in row-major
+        order.
 """
 
 from __future__ import annotations
@@ -26,13 +28,13 @@ if TYPE_CHECKING:
     from slipid.exports.c99.builder import Builder
 
 Cells = np.ndarray
-"""Numpy array (dtype object) of `Cell`s, as defined at the top of this file."""
+"""Numpy array (dtype object) of `Cell`s."""
 LOOP_FROM = 7
 """Smallest length of an axis that becomes a loop in C; shorter axes are unrolled."""
 
 
 class NoFormError(Exception):
-    """Reason why a primitive cannot be turned into C with these arguments."""
+    """Error with the reason why a primitive cannot be converted to C with its arguments."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +58,12 @@ class Memory:
         name: name in C.
         kind: kind of the stored numbers.
         size: count of the stored numbers.
-        home: block that writes the numbers; None if they are there before the function begins.
-        values: bytes of a table of constants, empty for other memory.
-        scalar: True if it is a single number that C accesses without an index.
-        lanes: True if it stores one number per lane of a variable. Truth values are then stored as
-            the numbers 1 and 0, since compilers vectorize loops over numbers of one size.
+        home: block that writes the numbers; None if they exist before the function begins.
+        values: bytes of a table of constants; empty for other memory.
+        scalar: True for a single number that C accesses without an index.
+        lanes: True if the memory stores one number per lane of a variable. Truth values are then
+            stored as the real numbers 1 and 0, since compilers vectorize loops over numbers of one
+            size.
     """
 
     name: str
@@ -74,9 +77,10 @@ class Memory:
 
 @dataclass(frozen=True)
 class At:
-    """The cell `memory[offset + stride * l + index]`, or `memory[table[l]]`; `l` is the lane.
+    """The cell `memory[offset + stride * l + index]`, or `memory[table[l]]`, where `l` is the lane.
 
-    `index` is an offset computed at run time, and `table` an integer array of constants.
+    `index` is a further offset that is computed at run time; `table` is an integer table of
+    constants.
     """
 
     memory: Memory
@@ -93,14 +97,14 @@ class At:
 
 @dataclass(eq=False)
 class Variable:
-    """A local variable in C: the result of a statement, computed in every lane if `lanes` is not 0.
+    """A local variable in C: the result of a statement, in every lane if `lanes` is not 0.
 
     Attributes:
         kind: kind of the number.
-        number: serial number, from which the name in C is made.
+        number: serial number, from which the name in C is formed.
         lanes: number of lanes; 0 for a single number.
-        home: block of the statement that computes it.
-        made_by: template and cells of that statement.
+        home: block of the statement that computes the variable.
+        made_by: template and cells of the statement that computes the variable.
     """
 
     kind: Kind
@@ -111,7 +115,7 @@ class Variable:
 
     @property
     def memory(self) -> Memory:
-        """Stack array with one number per lane, for blocks other than `home`."""
+        """Stack array with one number per lane, from which blocks other than `home` read it."""
         return Memory(f"m{self.number}", self.kind, self.lanes, self.home, lanes=True)
 
 
@@ -124,12 +128,12 @@ class Statement:
     """The C statement `target = template`, with cells for the placeholders {0}, {1} and so on.
 
     Attributes:
-        target: variable that it computes; None if the template is a whole C statement.
+        target: variable that the statement computes; None if the template is a whole C statement.
         template: C text with placeholders for cells.
-        cells: cells for these placeholders.
-        writes: memory that the template writes to.
-        times: iterations of a loop around this statement alone; 0 for no such loop.
-        always: True if the statement is kept even if nothing reads the memory that it writes.
+        cells: cells for the placeholders.
+        writes: memory that the template writes to; None if it writes to no memory.
+        times: number of iterations of a loop around only this statement; 0 without such a loop.
+        always: True if the statement is needed even if nothing reads the memory that it writes.
         start: initial value of a reduction; empty for other statements.
         source: file and line of the Python code that the statement is generated from.
     """
@@ -148,13 +152,14 @@ class Statement:
 class CodeBlock:
     """Statements in sequence, within a loop over lanes if `lanes` is not 0.
 
-    A block with bodies is an if-else or a repetition instead, and has no statements of its own.
+    A block with bodies is instead an if-else or a repetition, without statements of its own.
 
     Attributes:
         owner: builder that the block belongs to.
         lanes: number of iterations of the loop; 0 for straight-line code.
-        calls: True if the loop contains reductions or calls of C's library, see `CALLS`.
-        when: condition of an if-else: if true, the first of two bodies runs, else the second.
+        calls: True if the loop contains reductions or calls of C's library, see
+            `slipid.exports.c99.builder.CALLS`.
+        when: condition of an if-else: if true, the first of the two bodies runs, else the second.
         times: number of times that the single body of a repetition runs.
         bodies: builders of the bodies.
         place: index of the block among the blocks of the owner.
@@ -179,7 +184,7 @@ class Array:
         shape: shape of the array.
         kind: kind of its numbers.
         axis: axis of the lanes; None without lanes.
-        cells: cells, with the shape of the array less its axis of lanes.
+        cells: cells, in the array's shape without the axis of the lanes.
     """
 
     shape: tuple[int, ...]
@@ -208,7 +213,7 @@ def axis_of(value: Value) -> int | None:
 
 
 def cells_of(shape: Sequence[int], cells: Sequence[Cell]) -> Cells:
-    """Return a list of cells, in row-major order, as a numpy array of this shape."""
+    """Return cells, listed in row-major order, as a numpy array of this shape."""
     out = np.empty(len(cells), dtype=object)
     out[:] = cells
     return out.reshape(shape)
@@ -223,7 +228,7 @@ def varies(cell: Cell) -> bool:
 
 
 def longest(shape: Sequence[int]) -> int | None:
-    """Return the longest axis, which becomes a loop; None if shorter than `LOOP_FROM`."""
+    """Return the longest axis, which becomes a loop; None if it is shorter than `LOOP_FROM`."""
     if max(shape, default=0) < LOOP_FROM:
         return None
     return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
@@ -240,7 +245,10 @@ def rows_of(values: np.ndarray, axis: int | None) -> np.ndarray:
 
 
 def read_at(memory: Memory, places: np.ndarray, index: Variable | None = None) -> Array:
-    """Return an array that reads memory at `places + index`; places are evenly spaced in a row."""
+    """Return an array that reads memory at the indices `places + index`.
+
+    Along the longest axis, `places` must be evenly spaced.
+    """
     axis = longest(places.shape)
     rows = rows_of(places, axis)
     cells = [

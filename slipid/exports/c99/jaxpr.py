@@ -1,7 +1,7 @@
-"""Access to traced functions of JAX that is the same for all supported versions of JAX.
+"""Access to traced functions of JAX in the same way for all supported versions of JAX.
 
-Only this module depends on where a version of JAX stores the parameters of a primitive, the
-functions that it calls, and the line of Python code from which it was traced.
+Only this module depends on where a version of JAX stores a primitive's parameters, the functions
+that a primitive calls, and the line of Python code from which a primitive was traced.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Params(dict[str, Any]):
     """Parameters of a primitive, keyed by their names in JAX.
 
     Raises:
-        DataError: in this version of JAX the primitive has no parameter of that name.
+        DataError: in this version of JAX the primitive has no parameter with a requested name.
     """
 
     def __init__(self, equation: JaxprEqn):
@@ -40,7 +40,7 @@ class Traced:
     """A traced function.
 
     Attributes:
-        jaxpr: its equations, arguments and results.
+        jaxpr: equations, arguments and results of the function, in JAX's form.
         constants: values of the constant variables of the jaxpr, in their order.
     """
 
@@ -49,9 +49,9 @@ class Traced:
 
     @classmethod
     def of(cls, written: object) -> Traced:
-        """Return a traced function from the object of JAX, in any supported version.
+        """Return a traced function from an object in which JAX represents a function.
 
-        JAX 0.10 has two classes for such objects, later versions have one.
+        JAX 0.10 has two classes for such objects, while later versions have one.
 
         Raises:
             DataError: this version of JAX represents functions in an unsupported way.
@@ -64,12 +64,12 @@ class Traced:
 
 @dataclass(frozen=True)
 class ScanParameters:
-    """Parameters of a scan, which applies a function repeatedly to its results.
+    """Parameters of a scan, which applies a function repeatedly to its own results.
 
     Attributes:
         body: the function.
         turns: number of times that the function is applied.
-        constants: number of leading arguments, which are the same in every iteration.
+        constants: number of leading arguments that are the same in every iteration.
         carried: number of further arguments, which are the results of the previous iteration.
     """
 
@@ -83,7 +83,7 @@ class ScanParameters:
         """Read the parameters in the form of JAX 0.10 (two counts) or of later versions (a tree).
 
         Raises:
-            DataError: this version of JAX represents them in an unsupported way.
+            DataError: this version of JAX represents the parameters in an unsupported way.
         """
         if "num_carry" in params:
             constants, carried = params["num_consts"], params["num_carry"]
@@ -106,7 +106,10 @@ def branches(params: Params) -> list[Traced]:
 
 
 def source_line(equation: JaxprEqn) -> str:
-    """Return file and line of the innermost code of slipid that created an equation, or ""."""
+    """Return file and line of the innermost slipid code outside `exports` that made an equation.
+
+    The result is empty if there is no such code.
+    """
     traceback = equation.source_info.traceback
     for frame in traceback.frames if traceback is not None else ():
         parts = Path(frame.file_name).parts
@@ -117,7 +120,7 @@ def source_line(equation: JaxprEqn) -> str:
 
 
 def unknown(what: str) -> DataError:
-    """Return the error that this version of JAX represents something in an unsupported way."""
+    """Return the error for a part of JAX that this version represents in an unsupported way."""
     return DataError(
         f"jax {jax.__version__} represents {what} in a way that this version of slipid does not "
         f"support; expected a supported version: pip install 'jax{KNOWN}'"

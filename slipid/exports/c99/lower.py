@@ -1,4 +1,4 @@
-"""Lowering of traced functions to C statements; constant expressions are computed at export.
+"""Conversion of traced functions to C statements; constant expressions are computed at export.
 
 The words lane, row, cell, source and place are defined in `slipid.exports.c99.ir`.
 """
@@ -54,10 +54,10 @@ RULES: dict[str, Rule] = {
     "scatter-mul": moves.scattered("mul", 1.0),
     "select_n": arithmetic.select,
 }
-"""Rules that turn a primitive of JAX into C, keyed by the primitive's name.
+"""Rules that convert a primitive of JAX to C, keyed by the primitive's name.
 
-Primitives in `MOVES`, which only move elements, have no rule here: they are applied at export to
-the indices of the elements, which shows where each element of the result comes from."""
+Primitives in `MOVES`, which only move elements, need no rule here: at export they are applied to
+the indices of the elements, which shows the origin of each element of the result (`moved`)."""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
 """Primitives that call another traced function, whose statements are inlined."""
 
@@ -68,7 +68,7 @@ _TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
 class UnsupportedError(DataError):
     """Error for a function that cannot be converted to C.
 
-    The message gives the primitive and its line of Python code.
+    The message gives the unsupported primitive and its line of Python code.
     """
 
 
@@ -105,8 +105,8 @@ def _results(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
     except NoFormError as error:
         known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
         raise UnsupportedError(
-            f"{builder.source}: '{name}' has no form in C ({error}); "
-            f"those that have one: {', '.join(known)}"
+            f"{builder.source}: the JAX primitive '{name}' has no form in C ({error}); use "
+            f"primitives out of {', '.join(known)}"
         ) from error
 
 
@@ -117,7 +117,7 @@ def _by_rule(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
         return _cond(builder, params, values)
     if name == "scan":
         return _scan(builder, params, values)
-    out: Any = equation.outvars[0].aval  # The type in JAX does not declare its attributes.
+    out: Any = equation.outvars[0].aval  # JAX's type for it does not declare shape and dtype
     shaped = Shaped(out.shape, out.dtype)
     if out.dtype not in _TYPES:
         raise NoFormError(f"numbers of type {out.dtype}")
@@ -128,12 +128,12 @@ def _by_rule(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
     if name in MOVES and not variable_index:
         return [moved(primitive, SOURCES.get(name, 0))(builder, values, params, shaped)]
     if name not in RULES:
-        raise NoFormError("no rule for it")
+        raise NoFormError("there is no rule for this primitive")
     return [RULES[name](builder, values, params, shaped)]
 
 
 def _cond(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
-    """Append an if-else with a function in each branch, and return the results."""
+    """Append an if-else whose branches are the functions of a `cond`, and return its results."""
     which, choices = values[0], branches(params)
     if len(choices) != 2:
         raise NoFormError("more than two branches")
@@ -160,7 +160,7 @@ def _memory(builder: Builder, like: Value, block: CodeBlock) -> Memory:
 
 
 def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
-    """Append a loop that applies a function repeatedly to its own result; return the result."""
+    """Append a loop that applies a function repeatedly to its results; return the last results."""
     scan = ScanParameters.of(params)
     carried, consts = scan.carried, scan.constants
     if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
@@ -182,9 +182,9 @@ def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
 
 
 def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
-    """Copy those cells of a result to variables that lie in memory about to be overwritten.
+    """Return a result without cells in memory that is about to be overwritten.
 
-    `overwritten` has the names of that memory.
+    Such cells are copied to variables first. `overwritten` has the names of the memory.
     """
     if not isinstance(value, Array):
         return value
@@ -222,7 +222,7 @@ def _place(memory: Memory, offset: int, stride: int) -> str:
 
 
 def _filled(value: Value) -> Value:
-    """Return a value unchanged, but one without elements as a numpy array."""
+    """Return a value unchanged, but convert an array without elements to a numpy array."""
     return value if prod(value.shape) else np.zeros(value.shape, DTYPES[kind_of_value(value)])
 
 

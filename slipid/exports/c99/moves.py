@@ -33,17 +33,18 @@ MOVES = frozenset(
         *("reshape", "rev", "slice", "split", "squeeze", "stack", "transpose", "unstack"),
     }
 )
-"""Primitives that only rearrange the elements of arrays, if all their indices are constant."""
+"""Primitives that only rearrange elements of arrays, provided that all indices are constant."""
 SOURCES = {"gather": 1, "dynamic_slice": 1}
-"""Number of leading arguments that a primitive rearranges; its other arguments are indices. The
-primitives that are not listed rearrange all arguments."""
+"""Number of leading arguments that a primitive rearranges; its further arguments are indices.
+Primitives that are not listed rearrange all their arguments."""
 
 
 def moved(primitive: Primitive, sources: int) -> Rule:
     """Return the rule of a primitive that rearranges the elements of its first `sources` arguments.
 
-    The other arguments, the indices, must be constant. If `sources` is 0, all arguments are
-    rearranged.
+    Further arguments are indices and must be constant. If `sources` is 0, all arguments are
+    rearranged. The primitive is applied to the elements' indices, to find the origin of each
+    element of the result.
     """
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -57,16 +58,17 @@ def moved(primitive: Primitive, sources: int) -> Rule:
 
 
 def scatter(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return an array with some elements replaced, at constant indices."""
+    """Return an array in which elements at constant indices are replaced."""
     old, where, new = values
     places = _scattered(numbered(old.shape), where, new.shape, params, prod(old.shape))
     return rearranged(builder, [old, new], places)
 
 
 def scattered(name: str, neutral: float) -> Rule:
-    """Return the rule of a primitive that adds to, or multiplies, elements at constant indices.
+    """Return the rule of a primitive that changes elements at constant indices by an operation.
 
-    Each index may occur only once. `neutral` is the neutral element of the operation.
+    `name` is the operation, "add" or "mul", and `neutral` its neutral element. Each index may occur
+    only once.
     """
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -82,9 +84,10 @@ def scattered(name: str, neutral: float) -> Rule:
 def _scattered(
     old: np.ndarray, where: Value, shape: tuple[int, ...], params: Params, fresh: int
 ) -> np.ndarray:
-    """Return `old` with the entries at the indices `where` replaced by `fresh`, `fresh` + 1, ...
+    """Return `old` with the elements at the indices `where` replaced by `fresh`, `fresh` + 1, ...
 
-    These are the places of the new elements, whose array has the shape `shape`.
+    The new numbers are source indices (places) of the elements of an array with the shape `shape`,
+    in row-major order.
     """
     if isinstance(where, Array):
         raise NoFormError("indices that are not constant")
@@ -98,7 +101,7 @@ def _scattered(
 
 
 def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return the part of an array that begins at indices computed at run time."""
+    """Return the part of an array whose first indices are computed at run time."""
     whole, starts, sizes = values[0], values[1:], params["slice_sizes"]
     memory = contiguous(builder, whole)
     base = _offset(builder, [along(builder, s, (), None).item() for s in starts], whole, sizes)
@@ -111,8 +114,8 @@ def _offset(
 ) -> Variable:
     """Return the row-major index of the first element of a part of an array.
 
-    The part is shifted into the array if it exceeds a bound. The index has lanes if any start index
-    has different values in different lanes.
+    As in JAX, a part that exceeds the array's bounds is shifted into the array. The result has
+    lanes if any start index has different values in different lanes.
     """
     terms, cells = [], []
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
@@ -130,7 +133,7 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
         raise NoFormError("batches of indices")
     if params["mode"] == lax.GatherScatterMode.FILL_OR_DROP:
-        raise NoFormError("indices out of range that give a fill value")
+        raise NoFormError("a mode in which indices out of range give a fill value")
     memory = contiguous(builder, whole)
     batch = [d for d in range(len(out.shape)) if d not in numbers.offset_dims]
     kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]

@@ -33,11 +33,11 @@ from slipid.exports.c99.ir import (
 from slipid.exports.fields import kind_of
 
 MOST_UNROLLED = 64
-"""Largest number of elements of an array that is still unrolled in C."""
+"""Largest number of elements of an array up to which it is unrolled in C."""
 
 
 class Sources:
-    """Elements of some arrays, flattened and concatenated; a place is an index into all of them.
+    """Elements of source arrays, flattened and concatenated; a place is an index of an element.
 
     Attributes:
         kind: kind of the numbers.
@@ -54,7 +54,7 @@ class Sources:
         return self._sources[k], place - int(self._starts[k])
 
     def _cell(self, place: int) -> tuple[Cell, int]:
-        """Return the cell that contains the element at a place, and the element's lane in it."""
+        """Return the cell that contains the element with index `place`, and the element's lane."""
         source, inner = self._source(place)
         if not isinstance(source, Array):
             return Constant(source.reshape(-1)[inner].item(), kind_of(source.dtype)), 0
@@ -63,11 +63,12 @@ class Sources:
         return source.cells[tuple(at)], lane
 
     def best_axis(self, places: np.ndarray) -> int | None:
-        """Return the best axis of lanes for an array whose elements come from these places.
+        """Return the best axis of lanes for an array of the elements with indices `places`.
 
-        It is the axis along which most rows are a cell of a source already, if at least half of all
-        elements are in such rows. Otherwise it is the longest axis, or None if the result is to be
-        unrolled: at most `MOST_UNROLLED` different elements, all axes shorter than 2 `LOOP_FROM`.
+        It is the axis along which most rows are already a cell of a source, if at least half of all
+        elements are in such rows. Otherwise it is the longest axis. An array with at most
+        `MOST_UNROLLED` different elements and axes shorter than 2 `LOOP_FROM` is unrolled instead,
+        and the result is None.
         """
         ready = {axis: self._ready_rows(places, axis) for axis in range(places.ndim)}
         axis = max(ready, key=lambda a: (ready[a], places.shape[a], a), default=None)
@@ -79,7 +80,7 @@ class Sources:
         return longest(places.shape) if large else None
 
     def _ready_rows(self, places: np.ndarray, axis: int) -> int:
-        """Return how many rows along an axis are a cell of a source already."""
+        """Return the number of rows along an axis that are already a cell of a source."""
         rows = np.moveaxis(places, axis, -1)
         if rows.shape[-1] < 2:
             return 0
@@ -87,7 +88,7 @@ class Sources:
         return sum(self._ready_cell(row) is not None for row in flat)
 
     def _ready_cell(self, row: np.ndarray) -> Cell | None:
-        """Return the cell of a source whose lanes are exactly these places, or None."""
+        """Return the cell of a source whose lanes are the elements with indices `row`, or None."""
         source, _ = self._source(int(row[0]))
         if not isinstance(source, Array) or source.axis is None or source.lanes != len(row):
             return None
@@ -96,7 +97,7 @@ class Sources:
         return cell if lane == 0 and np.array_equal(row, whole) else None
 
     def one(self, place: int) -> Cell:
-        """Return the cell of the single element at a place."""
+        """Return a cell for the single element with index `place`."""
         if place not in self._ones:
             self._ones[place] = self._one(place)
         return self._ones[place]
@@ -113,7 +114,7 @@ class Sources:
         return At(cell.memory, cell.offset + cell.stride * lane, index=cell.index)
 
     def row(self, row: np.ndarray) -> Cell:
-        """Return the cell whose lanes are the elements at these places."""
+        """Return a cell whose lanes are the elements with indices `row`."""
         ready = self._ready_cell(row)
         if ready is not None:
             return ready
@@ -140,13 +141,16 @@ class Sources:
         return At(first.memory, 0, table=self._builder.names.table(places, "int"))
 
     def _laned_source(self, row: np.ndarray) -> Value | None:
-        """Return the array with lanes that all elements of a row come from; None without one."""
+        """Return the source with lanes that contains all elements of a row; None without one."""
         source, *others = (self._source(int(place))[0] for place in row)
         same = all(other is source for other in others)
         return source if same and axis_of(source) is not None else None
 
     def copied(self, places: np.ndarray) -> Memory:
-        """Return memory that contains exactly these elements in order, copied only if needed."""
+        """Return memory that holds exactly the elements with indices `places`, in this order.
+
+        The elements are copied only if no memory holds them in this way.
+        """
         cells = [self.one(int(place)) for place in places]
         offsets = _places(cells)
         first = cells[0]
@@ -162,7 +166,7 @@ class Sources:
         return memory
 
     def _copy(self, memory: Memory, start: int, group: list[Cell]) -> None:
-        """Copy a group of evenly spaced elements, or one element, to memory from index `start`."""
+        """Copy a single element, or evenly spaced elements, to memory from index `start` on."""
         first, *rest = group
         if not rest:
             self._builder.fill(memory, f"{{memory}}[{start}] = {{0}};", first)
@@ -175,7 +179,7 @@ class Sources:
 
 
 def contiguous(builder: Builder, value: Value) -> Memory:
-    """Store an array in row-major order, unless it is stored so already; return the memory."""
+    """Return memory that holds an array in row-major order; the array is stored there if needed."""
     if not isinstance(value, Array):
         return builder.names.table(value, kind_of(value.dtype))
     key = id(value.cells)
@@ -199,7 +203,7 @@ def _contiguous(builder: Builder, value: Array) -> Memory:
 
 
 def _places(cells: Sequence[Cell]) -> np.ndarray | None:
-    """Return the offsets of cells in memory; None unless all are in the same memory."""
+    """Return the offsets of cells in memory; None unless all cells are in the same memory."""
     first = cells[0]
     for cell in cells:
         if not isinstance(cell, At) or not isinstance(first, At):
@@ -210,9 +214,9 @@ def _places(cells: Sequence[Cell]) -> np.ndarray | None:
 
 
 def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
-    """Divide cells, in order, into groups that one loop can copy.
+    """Divide cells, in their order, into groups that can each be copied by one loop or statement.
 
-    A group is three or more evenly spaced cells of the same memory, or a single cell.
+    A group has three or more evenly spaced cells of the same memory, or it is a single cell.
     """
     runs: list[list[Cell]] = []
     for cell in cells:
@@ -227,14 +231,15 @@ def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
 def rearranged(
     builder: Builder, sources: Sequence[Value], places: np.ndarray, axis: int | None = -1
 ) -> Value:
-    """Return the array whose elements are at these places of the sources.
+    """Return a new array of elements of the sources.
 
     Args:
         builder: builder of the code.
         sources: arrays that the elements come from.
-        places: for every element of the result, its index in the sources, which are flattened and
-            concatenated.
-        axis: axis of the result's lanes, None for no lanes; by default (-1) as `Sources.best_axis`.
+        places: for every element of the result, its index in the flattened and concatenated
+            sources.
+        axis: axis of the result's lanes, None for no lanes; the default -1 means the axis that
+            `Sources.best_axis` returns.
     """
     constants = [np.ravel(s) for s in sources if not isinstance(s, Array)]
     if len(constants) == len(sources):
@@ -262,7 +267,7 @@ def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | No
 
 
 def _row_of_constants(builder: Builder, row: np.ndarray) -> Cell:
-    """Return the cell of a row of constants: a table, or a single constant if all are equal."""
+    """Return a cell for a row of constants: a table, or a single constant if all are equal."""
     kind = kind_of(row.dtype)
     if row.tobytes() == len(row) * row[:1].tobytes():
         return Constant(row[0].item(), kind)

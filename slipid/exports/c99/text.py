@@ -1,4 +1,4 @@
-"""Conversion of statements to C99 text: unused statements are omitted, stack arrays are shared."""
+"""Conversion of statements to C99 text, without unused statements and with shared stack arrays."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from slipid.exports.fields import DTYPES, Kind
 class Usage:
     """Liveness analysis: which statements and arrays of a builder are used, and when.
 
-    The code is scanned backwards from its end, since a statement is needed if a later one uses its
-    result. Steps are therefore counted downwards, so that an earlier step has a smaller index.
+    The code is scanned backwards from its end, since a statement is needed if a later statement
+    uses its result. The step number therefore counts down from 0, so that an earlier step of the
+    program has a smaller number.
 
     Attributes:
         live: `id` of each statement that is needed.
         read: names of all memory that is read.
-        shared: array on the stack for each memory, keyed by the memory's name.
+        shared: stack array for each memory, keyed by the memory's name.
     """
 
     def __init__(self, builder: Builder):
@@ -60,7 +61,10 @@ class Usage:
             self._uses(cell, block)
 
     def _mark_bodies(self, nested: CodeBlock) -> None:
-        """Mark what the bodies use; memory written before a repetition stays live until its end."""
+        """Mark what the bodies use; memory from outside stays live until the end of the bodies.
+
+        The bodies of a repetition run several times, so that memory read in them is needed again.
+        """
         end = self._step
         for body in nested.bodies:
             self._scan(body)
@@ -93,7 +97,7 @@ class Usage:
             self._use_array(memory)
 
     def _use_array(self, memory: Memory) -> None:
-        """Mark an array as used in this step."""
+        """Extend the life of an array to the present step."""
         life = self._lives.setdefault(memory.name, _Life(memory, self._step, self._step))
         life.first = min(life.first, self._step)
 
@@ -126,7 +130,7 @@ class StackArray(NamedTuple):
 def _shared(arrays: list[_Life]) -> dict[str, StackArray]:
     """Return the stack array for each memory, keyed by the memory's name.
 
-    Two memories share an array if they have the same kind and size and are never in use at once.
+    Memory of the same kind and size shares an array if its lives do not overlap.
     """
     slots: dict[tuple[Kind, int], list[_Life]] = {}
     shared: dict[str, StackArray] = {}
@@ -171,7 +175,7 @@ def table(memory: Memory) -> list[str]:
 
 
 def wrapped(words: Iterable[str], indent: str) -> list[str]:
-    """Return words joined by commas, in lines of at most `CODE_WIDTH` characters."""
+    """Join words by commas, in lines of at most `CODE_WIDTH` characters."""
     lines = _broken(", ".join(words) + ",", CODE_WIDTH - 1, indent, indent)
     return [*lines[:-1], lines[-1].removesuffix(",")]
 
@@ -182,7 +186,7 @@ class FunctionBody:
     Attributes:
         lines: lines of declarations and statements.
         reads: names of all memory that the code reads.
-        scratch: total size of its arrays on the stack, counted in numbers.
+        scratch: total size of the code's arrays on the stack [numbers].
     """
 
     def __init__(self, builder: Builder):
@@ -241,7 +245,7 @@ class FunctionBody:
         return lines
 
     def _write(self, statement: Statement, cells: list[str], indent: str) -> list[str]:
-        """Return the C text of a statement that writes to memory, in a loop if it has one."""
+        """Return the C text of a statement that writes to memory, within its loop if it has one."""
         assert statement.writes is not None
         text = statement.template.format(*cells, memory=self._name(statement.writes))
         if statement.times:
@@ -250,7 +254,7 @@ class FunctionBody:
         return [f"{indent}{text}"]
 
     def _where(self, statement: Statement, indent: str) -> list[str]:
-        """Return a comment with the Python line of a statement if it differs from the last one."""
+        """Return a comment with a statement's Python line, unless it is the last comment's line."""
         if statement.source == self._source:
             return []
         self._source = statement.source
@@ -290,7 +294,7 @@ def folded(text: str, indent: str) -> list[str]:
 
 
 def _broken(text: str, width: int, first: str, later: str) -> list[str]:
-    """Return text as lines, broken at spaces alone; `first` and `later` are their indents."""
+    """Return text as lines, broken only at spaces; `first` and `later` are the lines' indents."""
     return textwrap.wrap(
         text,
         width,

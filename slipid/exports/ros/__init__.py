@@ -1,1 +1,1 @@
-"""The files of a ROS 2 folder; `slipid.exports.ros.folder` combines them."""
+"""Content of the files in a ROS 2 folder; `slipid.exports.ros.folder` combines them."""

@@ -1,14 +1,15 @@
-"""The drive controller of ros2_controllers with the kinematics of a robot, if there is one.
+"""Drive controller of ros2_controllers whose kinematics are those of a robot, if there is one.
 
-Such controllers convert a body twist (vx, vy, yaw rate W) to wheel speeds by
+The drive controllers convert a body twist (vx, vy, yaw rate W) to wheel speeds by
 
     omni      r w_k = sin(t_k) vx - cos(t_k) vy - R W,   t_k = wheel_offset + 2 pi k / n
-    mecanum   r w   = vx -/+ vy -/+ s W,                 s = lx + ly, about the middle of the wheels
+    mecanum   r w   = vx -/+ vy -/+ s W,                 s = lx + ly
 
-where w_k is the speed of wheel k [rad/s], r the wheel radius [m] and R the base radius [m]. For
-mecanum wheels the two signs are - - front left, + + front right, - + rear right and + - rear left;
-lx and ly are half the wheelbase and half the track [m]. The n omni wheels stand evenly on a circle
-and are numbered counter-clockwise from 0; a positive speed turns the robot clockwise.
+where w_k is the speed of wheel k [rad/s], r the wheel radius [m] and R the base radius [m]. The n
+omni wheels are evenly spaced on a circle and numbered counter-clockwise from 0; a positive speed
+turns the robot clockwise. For mecanum wheels the twist is that of the middle of the wheels; the two
+signs are - - front left, + + front right, - + rear right and + - rear left; lx and ly are half the
+wheelbase and half the track [m].
 
 Source: github.com/ros-controls/ros2_controllers, `compute_robot_velocity` of
 omni_wheel_drive_controller, `update_and_write_commands` of mecanum_drive_controller.
@@ -23,10 +24,10 @@ from slipid.exports.ros.yaml_text import Parameter
 from slipid.robot.deployed import DeployedRobot
 
 LARGEST_DIFFERENCE = 0.05
-"""Largest difference of kinematics at which a controller still fits a robot.
+"""Largest difference of kinematics with which a controller is still used for a robot.
 
-It is the error of a rim speed as a fraction of the body's speed [1], the speed is that of points on
-the base radius if the body turns on the spot."""
+The difference is the largest error of a rim speed, as a fraction of the body's speed [1]; while the
+body turns on the spot, its speed is the speed of points on the base radius."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
@@ -36,10 +37,10 @@ class DriveController:
 
     Attributes:
         name: name of the controller.
-        odometry: topic of its odometry, relative to the controller's name.
-        covariances: parameters with the diagonals of the covariances of pose and twist.
-        wheels: numbers of the robot's wheels in the controller's order.
-        turned: for each of these wheels, whether its speed has the opposite sign in the controller.
+        odometry: topic of the controller's odometry, relative to the controller's name.
+        covariances: names of the parameters for the diagonals of the covariances of pose and twist.
+        wheels: indices of the robot's wheels in the controller's order.
+        turned: for each of `wheels`, True if its speed has the opposite sign in the controller.
         parameters: parameters of the controller.
         difference: largest difference of the controller's kinematics from the robot's, as in
             `LARGEST_DIFFERENCE` [1].
@@ -55,12 +56,12 @@ class DriveController:
 
     @property
     def plugin(self) -> str:
-        """Type of the controller, as the controller manager names it."""
+        """Type of the controller for the controller manager."""
         return f"{self.name}/{self.name.title().replace('_', '')}"
 
 
 def drive_controller_of(robot: DeployedRobot) -> DriveController | None:
-    """Return the controller for a robot; None if no controller has its kinematics."""
+    """Return the controller for a robot; None if no controller has the robot's kinematics."""
     found = (_mecanum(robot), _omni(robot))
     fitting = (c for c in found if c is not None and c.difference <= LARGEST_DIFFERENCE)
     return next(fitting, None)
@@ -85,21 +86,22 @@ def _with_signs(
 
 
 def _difference(robot: DeployedRobot, kinematics: Float[np.ndarray, "wheel 3"]) -> float:
-    """Return the rim speed error of a difference of kinematics, as `LARGEST_DIFFERENCE` [1]."""
+    """Return the measure of `LARGEST_DIFFERENCE` for a difference of kinematics matrices [1]."""
     scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
     return float(np.abs(kinematics * scale).max())
 
 
 def _omni(robot: DeployedRobot) -> DriveController | None:
-    """Return the controller for omni wheels evenly on a circle, beginning with the first wheel.
+    """Return the controller for omni wheels evenly spaced on a circle, from the first wheel on.
 
-    It is None for fewer than three wheels.
+    The result is None for fewer than three wheels. Other arrangements of wheels show as a large
+    `difference`.
     """
     places, count = np.asarray(robot.places), robot.wheels
     if count < 3:
         return None
     azimuth = np.arctan2(places[:, 1], places[:, 0])
-    # 1e-6: an azimuth a rounding error below that of the first wheel must not wrap to 2 pi
+    # add 1e-6, so that an azimuth a rounding error below the first wheel's does not wrap to 2 pi
     order = np.argsort(np.mod(azimuth - azimuth[0] + 1e-6, 2 * np.pi))
     rows, turned = _with_signs(robot, order, axis=2, sign=-1.0)
     even = 2 * np.pi * np.arange(count) / count
@@ -161,17 +163,17 @@ def _mecanum(robot: DeployedRobot) -> DriveController | None:
 
 
 _JOINTS = (
-    "Replace these by the names of your joints, in this order; the number is that of the wheel "
-    "in robot.json and in the logs. README.md lists the joints that must be reversed."
+    "Replace these names by the names of your joints, in this order; the number in a name is the "
+    "wheel's number in robot.json and in the logs. README.md lists the joints to reverse."
 )
 _OFFSET = (
-    "Direction from the middle to the first of these wheels, from straight ahead [rad]: the mean "
-    "over the wheels of the values computed from their identified drive directions."
+    "Direction from the middle to the first of these wheels, from straight ahead [rad]: a mean "
+    "over the wheels, computed from their identified drive directions."
 )
 _BASE = (
-    "robot.base_radius, from the middle to the wheels [m], the identified value. It has no "
-    "multiplier."
+    "robot.base_radius, distance from the middle to the wheels [m], as identified. The controller "
+    "has no multiplier for it."
 )
-_RADIUS = "robot.wheel_radius [m], the identified value. It has no multiplier."
-_MIDDLE = "The origin of the body as seen from the middle of the wheels [m, m, rad]."
-_REACH = "lx + ly [m]: the mean over the wheels of their identified levers about their middle."
+_RADIUS = "robot.wheel_radius [m], as identified. The controller has no multiplier for it."
+_MIDDLE = "Pose of the body's origin relative to the middle of the wheels [m, m, rad]."
+_REACH = "lx + ly [m]: mean lever arm of the wheels about their middle, as identified."

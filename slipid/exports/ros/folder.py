@@ -1,6 +1,6 @@
 """A ROS 2 folder of an identified robot: drive controller, localization, parameters, README.
 
-All numbers in YAML files are written with all digits, so that they are read back exactly.
+Numbers in YAML files are written with all digits, so that they are read back exactly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,32 +38,35 @@ from slipid.robot.deployed import DeployedRobot
 
 USES: Mapping[str, str] = {
     "drive_controller.yaml": "geometry and covariances (on the worst floor) for the drive "
-    "controller: pass it to the spawner or the controller manager, after entering the names of "
-    "your joints",
-    "robot_localization.yaml": "extended Kalman filter for the odometry of that controller (on "
-    "the worst floor): `ros2 run robot_localization ekf_node --ros-args --params-file` this file",
-    "robot_localization_slipid.yaml": "the same filter for odometry with estimated slip; its "
-    "publisher must use the covariance given in the file",
-    "slipid.yaml": "every number of the robot, gains and limits, as parameters of a node `slipid`",
-    "slipid_parameters.yaml": "declaration of these parameters for generate_parameter_library: "
-    "types, descriptions with verdicts, and validators; the defaults are the identified numbers",
+    "controller: enter the names of your joints, then pass the file to the spawner or the "
+    "controller manager",
+    "robot_localization.yaml": "parameters of the extended Kalman filter for the odometry of that "
+    "controller (on the worst floor): run `ros2 run robot_localization ekf_node --ros-args "
+    "--params-file` with this file",
+    "robot_localization_slipid.yaml": "parameters of the same filter for odometry with estimated "
+    "slip; the odometry's publisher must use the covariance given in the file",
+    "slipid.yaml": "every parameter of the robot, gains and limits, as parameters of a node "
+    "`slipid`",
+    "slipid_parameters.yaml": "input for generate_parameter_library, which generates code that "
+    "declares the parameters in slipid.yaml: types, descriptions with verdicts, and validators; "
+    "the defaults are the identified values",
 }
-"""Use of each file, keyed by name, without the files for single floors."""
+"""Use of each file, keyed by the file's name, except for the files of single floors."""
 _FLOOR = (
-    "covariances of the drive controller and process noise of `robot_localization.yaml` on this "
-    "floor: load it after those files, whose values it overrides"
+    "covariances of the drive controller and process noise of the filter on this floor: load this "
+    "file after `drive_controller.yaml` and `robot_localization.yaml`, whose values it overrides"
 )
 _ENCODERS = "the drive controller, which ignores slip"
 _ESTIMATED = (
-    "slipid's estimator, or another one that estimates slip and publishes this diagonal as the "
+    "slipid's estimator, or of another estimator of slip, which must publish this diagonal as the "
     "covariance of its twist"
 )
 
 
 def ros2_files(robot: DeployedRobot) -> dict[str, str]:
-    """Return the text of the files of a ROS 2 folder by path, for the robot's load set-up.
+    """Return the texts of a ROS 2 folder for the robot's load set-up, keyed by the file's path.
 
-    The file of the drive controller is absent if no controller of ros2_controllers has the robot's
+    There is no file for a drive controller if no controller of ros2_controllers has the robot's
     kinematics.
     """
     drive, errors = drive_controller_of(robot), odometry_errors(robot)
@@ -106,8 +109,9 @@ def _covariances(
         f"ignores slip, d = {short(DISTANCE_M)} m after the last correction of its pose: "
         "(effect^2 + slip^2) d^2 + process^2 d (for x and y, the larger value of along and "
         f"across), plus the sideways error due to the heading. Effect {effect}, slip {slip} "
-        f"(along, across [m/m], yaw [rad/m]), process {process} (per sqrt(m)). They are constant "
-        "here, while the true ones grow with the path. Wheels do not measure z, roll and pitch."
+        f"(along, across [m/m], yaw [rad/m]), process {process} (per sqrt(m)). These variances are "
+        "constant, while true variances grow with the path. Wheels do not measure z, roll and "
+        "pitch."
     )
     twist = (
         f"Variances of velocities [m^2/s^2, rad^2/s^2]: (effect^2 + slip^2) v^2 + process^2 v / T "
@@ -127,7 +131,7 @@ def _readme(
     errors: tuple[OdometryErrors, ...],
     uses: Mapping[str, str],
 ) -> str:
-    """Return the text of README.md; `uses` is the use of each file by its path."""
+    """Return the text of README.md; `uses` is the use of each file, keyed by its path."""
     values = {
         "HEAD": in_markdown(robot),
         "FILES": table(("file", "use"), [(f"`{name}`", use) for name, use in uses.items()]),
@@ -151,19 +155,19 @@ def _controller(drive: DriveController | None) -> str:
     if drive is None:
         return filled("ros2/no_drive.md", {"SHARE": f"{LARGEST_DIFFERENCE:.0%}"}).rstrip()
     difference = (
-        f"differ from the identified ones by {short(100 * drive.difference)} % of a rim speed at "
-        "most: it knows no drive directions of single wheels."
+        f"differ from the identified kinematics by at most {short(100 * drive.difference)} % of a "
+        "rim speed, since the controller has no parameters for drive directions of single wheels."
     )
     values = {
         "NAME": drive.name,
         "PLUGIN": drive.plugin,
-        "DIFFERENCE": difference if drive.difference > 1e-9 else "are the identified ones.",
+        "DIFFERENCE": difference if drive.difference > 1e-9 else "are the identified kinematics.",
     }
     return filled("ros2/drive.md", values).rstrip()
 
 
 def _wheels(robot: DeployedRobot, drive: DriveController | None) -> list[str]:
-    """Return the table with order, places and directions of wheels, and joints to reverse."""
+    """Return the table with order, positions and directions of wheels, and joints to reverse."""
     places, record = np.asarray(robot.places), robot.record
     offsets = np.broadcast_to(record.parameters["robot.drive_offset"].value, (robot.wheels,))
     order = range(robot.wheels) if drive is None else drive.wheels
@@ -204,7 +208,7 @@ def _stds(variances: Sequence[float]) -> str:
 
 
 def _names(robot: DeployedRobot) -> list[str]:
-    """Return the table with the names of floors and load set-ups in parameters."""
+    """Return the table of the names that floors and load set-ups have in ROS parameters."""
     record = robot.record
     rows = [
         (kind, label, f"`{name}`")
@@ -215,7 +219,7 @@ def _names(robot: DeployedRobot) -> list[str]:
 
 
 def _numbers(robot: DeployedRobot) -> list[str]:
-    """Return the table with every number and its source."""
+    """Return the table with every parameter of the robot and the source of its value."""
     rows = []
     for row in number_rows(robot):
         number = (short(row.value), row.unit, interval(row.interval90))

@@ -1,20 +1,21 @@
 """Errors of odometry on each floor as variances for ROS messages, and filter parameters.
 
-Over a path length d [m] an error grows by a constant part (std e of the effect [m/m, rad/m]) and by
-a random part (std q of the process noise [m/sqrt(m), rad/sqrt(m)]), so that its variance is (e d)^2
-+ q^2 d. Odometry that ignores slip also has the slip of its wheels as an error: its e^2 is effect^2
-+ slip^2, where slip is the root mean square of the contact model's slip over directions of travel.
-A constant covariance cannot depend on the direction of travel, so x and y both get the larger
-variance of along and across. A wrong heading moves the robot sideways; with e_w and q_w of the yaw
-this adds the variance (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
+Over a path length d [m] an error has a constant part (std e of the effect [m/m, rad/m]) and a
+random part (std q of the process noise [m/sqrt(m), rad/sqrt(m)]), so that its variance is
+(e d)^2 + q^2 d. For odometry that ignores slip, the slip of the wheels is an error as well: e^2 is
+then effect^2 + slip^2, where slip is the root mean square of the contact model's slip over
+directions of travel. A constant covariance cannot depend on the direction of travel, so x and y
+both get the larger of the variances along and across. A wrong heading moves the robot sideways;
+with the values e_w and q_w of e and q in yaw, this adds the variance
+(e_w d^2 / 2)^2 + q_w^2 d^3 / 3 across.
 
-ROS drive controllers put one constant diagonal into every message, which is not a true covariance
-of odometry. It is computed here for the path length `DISTANCE_M`, and that of twists for the
-highest speed of the fitted runs.
+ROS drive controllers put one constant diagonal into every message, although the true covariance of
+odometry grows with the path. Here the diagonal of the pose is computed for the path length
+`DISTANCE_M`, and the diagonal of the twist for the highest speed of the fitted runs.
 
 The filter is robot_localization's extended Kalman filter for the odometry of a robot. Its state is
 x, y, z, roll, pitch, yaw, their rates in the body frame, and accelerations ahead, sideways and up;
-it adds process noise times the elapsed time.
+in every prediction it adds process noise times the elapsed time to the covariance.
 
 Source: github.com/cra-ros-pkg/robot_localization, params/ekf.yaml, `Ekf::predict`.
 """
@@ -36,9 +37,9 @@ from slipid.robot.deployed import DeployedRobot, RobotArrays
 from slipid.robot.record import Axes, axes_of
 
 DISTANCE_M = 1.0
-"""Path length since the last correction of the pose for which the variances are computed [m]."""
+"""Path length since the last correction of the pose for which its variances are computed [m]."""
 PERIOD_S = 0.02
-"""Time between two messages of odometry for which the variances of twists are computed [s]."""
+"""Time between two odometry messages for which the variances of twists are computed [s]."""
 UNKNOWN = 1e6
 """Variance of height [m^2], roll and pitch [rad^2], which wheels do not measure."""
 DIRECTIONS = 24
@@ -53,7 +54,8 @@ class OdometryErrors:
         floor: name of the floor.
         process: std of random errors [m/sqrt(m)], [m/sqrt(m)], [rad/sqrt(m)].
         effect: std of the contact model's effects [m/m], [m/m], [rad/m].
-        slip: slip of the wheels, which encoders do not measure [m/m], [m/m], [rad/m].
+        slip: root mean square slip of the wheels, which odometry from encoders ignores [m/m],
+            [m/m], [rad/m].
     """
 
     floor: str
@@ -63,11 +65,11 @@ class OdometryErrors:
 
     @property
     def constant(self) -> Axes:
-        """Std of the constant error per metre of path, effect and slip together [m/m, rad/m]."""
+        """Std of the constant error (effect and slip) per metre of path [m/m, m/m, rad/m]."""
         return axes_of(np.hypot(self.effect, self.slip))
 
     def without_slip(self) -> "OdometryErrors":
-        """Return the errors of odometry that estimates slip: those of the contact model."""
+        """Return the errors of odometry that estimates slip: only the contact model's errors."""
         return replace(self, slip=(0.0, 0.0, 0.0))
 
     def pose(self, distance: float) -> Axes:
@@ -81,22 +83,22 @@ class OdometryErrors:
     def twist(self, speed: float, period: float) -> Axes:
         """Return the variances of the velocity over a period [m^2/s^2, m^2/s^2, rad^2/s^2].
 
-        They are (e v)^2 + q^2 v / period at the speed v [m/s].
+        At the speed v [m/s] the variances are (e v)^2 + q^2 v / period.
         """
         e, q = np.asarray(self.constant), np.asarray(self.process)
         return _larger_in_plane((e * speed) ** 2 + q**2 * speed / period)
 
     def walk(self, speed: float, distance: float) -> Axes:
-        """Return the variances per second of a random walk [m^2/s, m^2/s, rad^2/s].
+        """Return variances per second of a random walk in place of the constant error.
 
-        After the path length d [m] at the speed v [m/s] its std equals the constant error e d, so
-        the variance per second is e^2 d v.
+        After the path length d [m] at the speed v [m/s] the std of the walk equals the constant
+        error e d, so the variance per second is e^2 d v [m^2/s, m^2/s, rad^2/s].
         """
         return _larger_in_plane(np.asarray(self.constant) ** 2 * distance * speed)
 
 
 def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
-    """Return the errors of odometry on each floor, in the robot's order."""
+    """Return the errors of odometry on each floor, in the order of the robot's `labels`."""
     slip = np.asarray(_slip(robot.arrays, jnp.asarray(top_speed(robot))))
     process, effect = np.asarray(robot.process), np.asarray(robot.effect)
     return tuple(
@@ -116,7 +118,7 @@ def top_speed(robot: DeployedRobot) -> float:
 
 
 def diagonal(planar: Axes) -> tuple[float, ...]:
-    """Return the variances of x, y, z [m^2], roll, pitch and yaw [rad^2]."""
+    """Return variances of x, y, z [m^2], roll, pitch, yaw [rad^2]; `planar` has x, y and yaw."""
     x, y, yaw = planar
     return (x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw)
 
@@ -146,19 +148,19 @@ FILTER_NODE = "ekf_filter_node"
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
 FUSED = ("vx", "vy", "vyaw")
-"""States that the filter takes from odometry. The odometry's pose is not used, since it is the
-integral of the same velocities."""
+"""States that the filter reads from odometry messages. The messages' pose is not used, since it is
+the integral of the same velocities."""
 PLANAR_NOISE = 1e-6
-"""Process noise, variance per second, of the states that `two_d_mode` keeps at zero."""
+"""Process noise (variance per second) of the states that `two_d_mode` keeps at zero."""
 ACCELERATION = 0.01
-"""Process noise of accelerations, variance per second [m^2/s^5]. No sensor measures them here, so
-it is the default of robot_localization."""
+"""Process noise of accelerations (variance per second) [m^2/s^5]; it is robot_localization's
+default, since no sensor measures accelerations here."""
 
 
 def filter_parameters(
     robot: DeployedRobot, errors: OdometryErrors, odometry: str, source: str
 ) -> tuple[Parameter, ...]:
-    """Return all parameters of the filter.
+    """Return all parameters of robot_localization's filter.
 
     Args:
         robot: identified robot.
@@ -167,8 +169,8 @@ def filter_parameters(
         source: description of the odometry's source, for a comment.
     """
     about = (
-        f"Odometry of {source}. Only its velocities are fused: its pose is their integral and "
-        "contains no further information. Order: " + ", ".join(STATE) + "."
+        f"Odometry of {source}. Only velocities are fused, since the odometry's pose is their "
+        "integral and contains no further information. Order: " + ", ".join(STATE) + "."
     )
     return (
         Parameter("frequency", 1 / PERIOD_S, "Assumed rate of the odometry [Hz]."),
@@ -189,9 +191,9 @@ def filter_parameters(
 def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
     """Return the process noise on a floor, a 15 x 15 matrix in row-major order.
 
-    Its diagonal is the variance per second of each state. That of the pose is
-    `OdometryErrors.walk`, that of velocities (a T)^2 per period T [s], with a the largest
-    acceleration [m/s^2, rad/s^2].
+    The diagonal is the variance per second of each state. For the pose it is `OdometryErrors.walk`;
+    for velocities it is (a T)^2 per period T [s], where a is the largest acceleration
+    [m/s^2, rad/s^2].
     """
     acceleration = float(Limits().acceleration)
     change = acceleration * float(robot.frame.radius)
@@ -204,7 +206,7 @@ def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
         f"over a path, with the same error after {short(DISTANCE_M)} m at the highest speed of "
         f"the fitted runs, {short(top_speed(robot))} m/s. Velocity: the change that the limit of "
         f"wheel acceleration, {short(acceleration)} rad/s^2, allows within {short(PERIOD_S)} s. "
-        "Accelerations: the default of the package. The other states are held at zero by "
+        "Accelerations: the default of robot_localization. All other states are held at zero by "
         "two_d_mode."
     )
     entries = tuple(matrix.reshape(-1).tolist())
@@ -215,6 +217,6 @@ _TF = (
     "Only one node may publish this transform: set enable_odom_tf of the drive controller to false."
 )
 _DYNAMIC = (
-    "False: the uncertainty of the pose also grows at standstill. True would scale the noise "
-    "with the square of the speed, which neglects slow motion."
+    "With false, the uncertainty of the pose also grows at standstill. True would scale the noise "
+    "with the square of the speed and so neglect the errors of slow motion."
 )

@@ -1,7 +1,7 @@
-"""Parameters of a ROS node `slipid`: the robot's parameters, named by their paths in robot.json.
+"""Parameters of a ROS node `slipid`: the robot's parameters, named by their robot.json paths.
 
-Names of floors and load set-ups are those of `identifiers`. Arrays per wheel are in the order of
-robot.json; matrices are in row-major order.
+Names of floors and load set-ups are converted by `identifiers`. Arrays with an element per wheel
+are in the order of robot.json; matrices are in row-major order.
 """
 
 import math
@@ -24,7 +24,7 @@ NODE = "slipid"
 
 
 def node_parameters(robot: DeployedRobot) -> tuple[Parameter, ...]:
-    """Return all parameters; those of a group follow one another."""
+    """Return all parameters of the node; parameters of the same group follow one another."""
     return (*_choices(robot), *_numbers(robot), *_shape(robot), *_errors(robot), *_controls(robot))
 
 
@@ -32,7 +32,7 @@ def _choices(robot: DeployedRobot) -> Iterator[Parameter]:
     loads = [load.name for load in robot.record.loads]
     names, labels = identifiers(loads, "load"), robot.labels
     chosen = names[loads.index(robot.load_setup)]
-    about = f"load set-up to which kinematics, noise and gains apply, one of: {listed(loads)}"
+    about = f"load set-up for which kinematics, noise and gains are valid, one of: {listed(loads)}"
     yield Parameter("load_setup", chosen, about, (Check("one_of<>", (names,)),))
     checks = _size(len(labels)), Check("unique<>", ())
     about = f"floors in the order of robot.json: {listed(labels)}"
@@ -40,7 +40,7 @@ def _choices(robot: DeployedRobot) -> Iterator[Parameter]:
 
 
 def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Yield every number of the record; groups and their numbers are in the declared order."""
+    """Yield every parameter in the robot's record, grouped, in the order of declarations."""
     floors = dict(zip(robot.labels, identifiers(robot.labels, "floor"), strict=True))
     names = [load.name for load in robot.record.loads]
     loads = dict(zip(names, identifiers(names, "load"), strict=True))
@@ -71,7 +71,7 @@ def _about(e: Entry, number: RecordedNumber) -> str:
 
 
 def _checks(e: Entry) -> Iterator[Check]:
-    """Yield the validators of a number of the robot: its size and its bounds."""
+    """Yield the validators of a parameter of the robot: for its size and its bounds."""
     d, several = e.declaration, e.size > 1
     if several:
         yield _size(e.size)
@@ -101,7 +101,7 @@ def _shape(robot: DeployedRobot) -> Iterator[Parameter]:
 
 
 def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Yield the parameters of the model's errors, and of the range of the fitted runs."""
+    """Yield the parameters about the model's errors, and about the range of the fitted runs."""
     zero, zeros = Check("gt_eq<>", (0.0,)), Check("lower_element_bounds<>", (0.0,))
     for k, name in enumerate(identifiers(robot.labels, "floor")):
         yield _flat(f"errors.{name}.process", robot.process[k], _PROCESS, _size(3), zeros)
@@ -114,7 +114,7 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
     yield Parameter("seen.highest_current", current, _HIGHEST_CURRENT, (zero,))
     yield _flat("seen.wheel_curve", robot.wheel_curve, _CURVE, _size(2 * robot.wheels))
     for name, value in asdict(robot.record.sensors).items():
-        yield Parameter(f"seen.{name}", bool(value), f"true if this was so in the logs: {name}")
+        yield Parameter(f"seen.{name}", bool(value), f"{name}: true if the logs had this")
 
 
 def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
@@ -145,14 +145,17 @@ def _flat(
 
 
 _PLACE = "centre of each wheel, x and y, in base radii"
-_DRIVE = "direction of travel of a positive wheel speed [rad], drive_offset left out"
-_ROLLER = "from the free rolling direction to the drive direction [rad]"
+_DRIVE = "direction of travel at a positive wheel speed, without drive_offset [rad]"
+_ROLLER = "angle from the free rolling direction to the drive direction [rad]"
 _FORWARD = "J: rim speed of each wheel from vx, vy [m/s], yaw rate [rad/s], a row per wheel"
-_INVERSE = "pseudo-inverse of J: vx, vy, yaw rate from rim speeds [m/s], a row each"
-_PROCESS = "std of random errors, per root of the path length, along, across [m/sqrt(m)], in yaw"
-_EFFECT = "std of effects, the same over a path, along, across [m/m], in yaw [rad/m]"
-_CURRENT = "std of measured currents around those of the model [A]"
-_TREND = "a + b v, excess of measured currents over the model's [A, A s/m]"
+_INVERSE = "pseudo-inverse of J: vx, vy, yaw rate from rim speeds [m/s], a row for each"
+_PROCESS = (
+    "std of random errors that grow with the root of the path length: along, across [m/sqrt(m)], "
+    "in yaw [rad/sqrt(m)]"
+)
+_EFFECT = "std of effects, errors that stay the same over a path: along, across [m/m], yaw [rad/m]"
+_CURRENT = "std of measured less modelled currents [A]"
+_TREND = "a [A], b [A s/m] of the excess a + b v of measured over modelled currents at a speed v"
 _HIGHEST_SPEED = "highest wheel speed of the fitted runs [rad/s]"
-_HIGHEST_CURRENT = "largest current of the model up to 0.8 of the highest speed [A]"
-_CURVE = "a, b of each wheel: slip ratio a + b |I| over all floors [1, 1/A]"
+_HIGHEST_CURRENT = "largest modelled current at up to 0.8 of the highest wheel speed [A]"
+_CURVE = "a [1], b [1/A] of each wheel's slip ratio a + b |I| at a current I, over all floors"

@@ -1,7 +1,8 @@
-"""YAML of ROS 2 parameters, and their declaration for `generate_parameter_library`.
+"""YAML files of ROS 2 parameters, and input files for `generate_parameter_library`.
 
-The declaration is a tree of names. Its leaves contain type, default, description, whether the
-parameter is read-only, and the names and arguments of validators.
+From an input file `generate_parameter_library` generates C++ code that declares the parameters. The
+file is a tree of names; its leaves contain type, default, description, whether the parameter is
+read-only, and the names and arguments of validators.
 """
 
 import textwrap
@@ -28,13 +29,13 @@ class Parameter:
     """One parameter of a node.
 
     Attributes:
-        name: name, with a point between the names of groups.
-        value: value, which is the default in a declaration.
-        about: description in one paragraph; empty if the description of the previous parameter
-            includes it.
+        name: name, with points between the names of groups and the parameter's own name.
+        value: value; it is the default value in input for `generate_parameter_library`.
+        about: description in one paragraph; empty if the previous parameter's description covers
+            this parameter as well.
         checks: validators of the value.
-        read_only: whether it can be set only when the node starts.
-        per_line: number of array entries per line; 0 for as many as fit.
+        read_only: True if the parameter can be set only when the node starts.
+        per_line: number of array elements per line; 0 for as many as a line can hold.
     """
 
     name: str
@@ -46,7 +47,7 @@ class Parameter:
 
     @property
     def type(self) -> str:
-        """Type of the parameter in declarations."""
+        """Type of the parameter in the terms of `generate_parameter_library`."""
         several = isinstance(self.value, tuple)
         one = self.value[0] if isinstance(self.value, tuple) else self.value
         return _TYPES[type(one)] + "_array" * several
@@ -59,7 +60,7 @@ _Leaf = Callable[[Parameter, str, str], Iterator[str]]
 def scalar(value: Scalar) -> str:
     """Return a value as text from which YAML 1.1 and 1.2 restore it exactly.
 
-    Floats get a point, and a sign in the exponent, since `1e-05` and `1.0e6` would be read as text.
+    A float gets a point, and its exponent a sign: YAML 1.1 would read `1e-05` and `1.0e6` as text.
     """
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -74,14 +75,14 @@ def scalar(value: Scalar) -> str:
 
 
 def comment(lines: Sequence[str]) -> list[str]:
-    """Return lines as comments of YAML."""
+    """Return lines of text as YAML comments."""
     return [f"# {line}".rstrip() for line in lines]
 
 
 def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
-    """Return the lines of a parameter file for some nodes, each a name with its parameters.
+    """Return the lines of a ROS parameter file for nodes, each given by its name and parameters.
 
-    Parameters of a group must follow one another.
+    Parameters of the same group must follow one another.
     """
     lines: list[str] = []
     for node, parameters in parts:
@@ -90,7 +91,7 @@ def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
 
 
 def declaration(namespace: str, parameters: Sequence[Parameter]) -> list[str]:
-    """Return the lines that declare parameters, with their values as defaults."""
+    """Return input lines for `generate_parameter_library`, with the values as defaults."""
     return ["", f"{namespace}:", *_nested(parameters, 1, _declared)]
 
 
@@ -132,7 +133,7 @@ def _declared(parameter: Parameter, name: str, indent: str) -> Iterator[str]:
 
 
 def _key(parameter: Parameter, name: str, indent: str) -> Iterator[str]:
-    """Yield the lines of name and value; a long array takes several lines."""
+    """Yield the lines with a parameter's name and value; a long array takes several lines."""
     value = parameter.value
     if not isinstance(value, tuple):
         yield f"{indent}{name}: {scalar(value)}"

@@ -196,8 +196,8 @@ class FloorFilter(eqx.Module):
     def _remaining_std(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Return the remaining std of every floor's effects as a fraction of the whole std [1].
 
-        The whole std is the std without an effect table. While wheels are on several floors it
-        remains, since the table's estimates are for all wheels on one floor.
+        The whole std is the std without an effect table. It remains while wheels are on several
+        floors, since the table's estimates are for all wheels on one floor.
         """
         alone = known[hypotheses_of(self.robot).uniform]
         share = alone / jnp.maximum(self.robot.rest @ under, 1e-12)

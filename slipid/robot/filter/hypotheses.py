@@ -29,7 +29,7 @@ class Hypotheses:
     Attributes:
         under: index of the floor under each wheel.
         beside: for each wheel, hypothesis and floor, index of the hypothesis that differs only by
-            having this floor under this wheel; the number of hypotheses if there is no such one.
+            having this floor under this wheel; without such a hypothesis, the number of hypotheses.
         uniform: for each floor, index of the hypothesis with this floor under all wheels.
         on: True if the hypothesis has the floor under the wheel.
     """

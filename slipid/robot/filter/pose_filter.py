@@ -2,10 +2,10 @@
 
 Process noise and effects increase the covariance. The effects, the friction of the floors and the
 bias of a gyro are further states, which pose fixes correct; the bias is also corrected at rest.
-Friction affects the motion only if wheels stand on several floors, so fitted runs that stay on one
-floor each leave it uncertain. Uncertainty about the floors is the scatter S of the hypotheses'
-twists xi_c about their mean xi, with probabilities p_c. An error d of the belief persists for a
-while:
+Friction affects the motion only while wheels stand on several floors, so fitted runs that each stay
+on a single floor do not determine it. Uncertainty about the floors is the scatter S of the
+hypotheses' twists xi_c about their mean xi, with probabilities p_c. An error d of the belief
+persists for a while:
 
     S = sum_c p_c (xi_c - xi) (xi_c - xi)^T = L L^T,   xi_true = xi + L d,   d ~ N(0, 1)
     d <- k d + sqrt(1 - k^2) noise,   k = exp(-far / doubt_m)

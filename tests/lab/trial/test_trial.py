@@ -442,7 +442,7 @@ def test_a_map_file_reaches_an_estimator_and_a_robot_that_has_numpy_alone(tmp_pa
 
 def test_an_empty_map_and_a_damaged_one_are_refused(tmp_path, deployed):
     (tmp_path / "lab.toml").write_text(LAB.replace("firm", "ice").replace("soft", "mud"))
-    with pytest.raises(DataError, match="surfaces ice, mud; expected some of those identified: fi"):
+    with pytest.raises(DataError, match=r"\(ice, mud\); expected a map with one or more of fi"):
         floor_map(tmp_path / "lab.toml", deployed)
     with pytest.raises(DataError, match=r"absent\.npz: .*expected a map written by Floor\.save"):
         Floor.load(tmp_path / "absent.npz", deployed.labels)
@@ -515,12 +515,10 @@ def test_impossible_trials_are_refused(tmp_path, deployed):
     with pytest.raises(DataError, match="no path 'square'; expected one of rectangle, circle"):
         path_of("square", 0.2, deployed)
     for speed in (0.0, 0.31, float("nan")):
-        with pytest.raises(DataError, match=r"expected above 0 and at most 0\.3 m/s"):
+        with pytest.raises(DataError, match=r"expected a speed above 0 and at most 0\.3 m/s"):
             path_of("circle", speed, deployed)
     assert path_of("circle", 0.3, deployed).duration < path_of("circle", 0.1, deployed).duration
-    with pytest.raises(
-        DataError, match=r"robot\.json: missing; it is written by `slipid identify`"
-    ):
+    with pytest.raises(DataError, match=r"robot\.json: missing; write it by `slipid identify`"):
         tr._tasks(tmp_path, tr.TrialOptions())
 
 
@@ -578,7 +576,7 @@ def test_a_controller_can_have_another_map_than_the_true_one(tmp_path, deployed,
     for k, place in enumerate(middle):
         under = floor.under(jnp.array([*place, 0.0]), jnp.zeros((1, 2)))
         assert labels[int(under[0])] == labels[1 - k]
-    with pytest.raises(DataError, match=r"strange\.toml: no surface 'moss'"):
+    with pytest.raises(DataError, match=r"strange\.toml: surface 'moss' was not identified"):
         jobs(told_map=tmp_path / "strange.toml")
 
 

@@ -1,5 +1,6 @@
-/* One control period every 50 ms. Fill in how your robot reads its sensors and drives its wheels.
-   A step keeps @STACK@ of intermediate numbers on the stack, half of that with SLIPID_FLOAT: see that the loop has it. */
+/* One control step every 50 ms. Fill in how your robot reads its sensors and drives its wheels.
+   A step keeps @STACK@ of intermediate numbers on the stack, half as much with SLIPID_FLOAT: make sure that
+   the task of loop() has a stack of that size. */
 #include <slipid.h>
 
 static slipid_state state;
@@ -21,7 +22,7 @@ void loop() {
   }
   const slipid_real dt = (slipid_real)(now_ms - last_ms) / 1000;
   last_ms = now_ms;
-  const slipid_real reference[6] = {0, 0, 0, 0, 0, 0}; /* where the robot should be, and how fast */
+  const slipid_real reference[6] = {0, 0, 0, 0, 0, 0}; /* pose and rates that the robot should have */
   slipid_nothing(&reading);
   /* reading.wheel_angle[0] = ...; reading.current[0] = ...; */
   slipid_step(&state, &reading, reference, dt, &estimate, command);

@@ -1,5 +1,5 @@
-/* Compares the code of this folder with what the library computed: cc -O2 -Isrc -o check test/check.c src/slipid.c -lm
-   Prints the largest difference and ends with 0 where it is small enough. */
+/* Compares the code of this folder with reference steps of slipid: cc -O2 -Isrc -o check test/check.c src/slipid.c -lm
+   Prints the largest difference; the exit code is 0 if the difference is small enough. */
 #include <math.h>
 #include <stdio.h>
 
@@ -8,7 +8,7 @@
 #include "golden.h"
 
 #ifdef SLIPID_FLOAT
-#define TOLERANCE 1e-3 /* rounding of 32 bits over all steps */
+#define TOLERANCE 1e-3 /* accumulated rounding of 32-bit numbers over all steps */
 #else
 #define TOLERANCE 1e-9
 #endif
@@ -19,7 +19,7 @@ static void compare(const char *what, int step, double got, double want, double 
   const double size = fabs(want) > scale ? fabs(want) : scale;
   const double gap = got == want ? 0.0 : fabs(got - want) / size;
   if (!(gap <= TOLERANCE)) {
-    printf("step %d, %s: %.17g where the library has %.17g\n", step, what, got, want);
+    printf("step %d, %s: %.17g; expected %.17g\n", step, what, got, want);
   }
   worst = gap > worst || !(gap == gap) ? gap : worst;
 }

@@ -1,11 +1,12 @@
-/* A robot on a line: the start pose, then in each line dt and what the sensors give; out come wheel
-   speeds [rad/s] and the time of the path [s]. nan stands for what is not measured. */
+/* Control loop for a robot whose readings come as text: first the start pose, then a line with dt
+   and the sensors' readings for each step; nan stands for a reading that is absent. Each output line
+   has the wheel speeds [rad/s] and the time of the path [s]. */
 #include <stdio.h>
 
 #include "slipid.h"
 
 #ifndef DIGITS
-#define DIGITS 9 /* behind the point; 15 to close a loop with a plant */
+#define DIGITS 9 /* decimal places; use 15 to close a loop with a plant */
 #endif
 
 static int numbers(slipid_real *into, int count) {

@@ -1,8 +1,8 @@
-/* Numbers: all arithmetic below is done in one type, double or float. */
+/* All arithmetic below uses one type of number, double or float. */
 typedef slipid_real real_t;
 #ifdef SLIPID_FLOAT
 #define R(x) x##F
-#define R_WIDE(x) ((x) > 0 ? FLT_MAX : -FLT_MAX) /* beyond the range of float */
+#define R_WIDE(x) ((x) > 0 ? FLT_MAX : -FLT_MAX) /* constants beyond the range of float */
 #define r_abs fabsf
 #define r_atan2 atan2f
 #define r_cos cosf
@@ -30,7 +30,7 @@ typedef slipid_real real_t;
 #define R_INFINITY ((real_t)INFINITY)
 #define R_NAN ((real_t)NAN)
 
-/* Inlined where speed counts, so that a loop over lanes becomes vector instructions. */
+/* Inline functions if the compiler optimizes for speed, so that it can vectorize loops. */
 #if defined(__GNUC__) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
 #define SLIPID_INLINE __attribute__((always_inline, unused)) static inline
 #elif defined(__GNUC__)
@@ -43,7 +43,7 @@ SLIPID_INLINE bool is_finite(real_t x) {
   return x - x == R(0.0);
 }
 
-/* Like those of JAX, not a number where either is. */
+/* As in JAX, the result is NaN if either argument is NaN. */
 SLIPID_INLINE real_t r_max(real_t a, real_t b) {
   return ((a > b) | (a != a)) ? a : b;
 }
@@ -64,14 +64,14 @@ SLIPID_INLINE int32_t i_min(int32_t a, int32_t b) {
   return (a < b) ? a : b;
 }
 
-/* The whole part, held within +-1e9; 0 where x is no number. */
+/* Integer part of x, limited to +-1e9; 0 if x is NaN. */
 SLIPID_INLINE int32_t to_int(real_t x) {
   const real_t held = (x > R(1e9)) ? R(1e9) : ((x < R(-1e9)) ? R(-1e9) : x);
   return (held == held) ? (int32_t)held : 0;
 }
 
-/* tanh(x) / y. Four steps tanh 2a = 2 n d / (d^2 + n^2) from the continued fraction of
-   tanh = n / d at x / 16; off by at most 7 units in the last place, and without a branch. */
+/* tanh(x) / y, without a branch: the continued fraction gives tanh(x / 16) = n / d, and four steps
+   tanh 2a = 2 n d / (d^2 + n^2) double the argument; errors are at most 7 units in the last place. */
 SLIPID_INLINE real_t r_tanh_over(real_t x, real_t y) {
   const real_t held = (x < R(-19.1)) ? R(-19.1) : ((x > R(19.1)) ? R(19.1) : x);
   const real_t z = held * R(0.0625);

@@ -9,10 +9,10 @@
 extern "C" {
 #endif
 
-/* Compile everything with SLIPID_FLOAT for numbers of 32 bits. */
+/* Define SLIPID_FLOAT for the whole build to use 32-bit numbers. */
 #ifdef SLIPID_FLOAT
 typedef float slipid_real;
-/* Names of their own, so that parts compiled for float and for double cannot be linked together. */
+/* Other names for float, so that parts compiled for float and for double cannot be linked together. */
 #define slipid_init slipid_init_float
 #define slipid_step slipid_step_float
 #define slipid_begin slipid_begin_float
@@ -24,49 +24,49 @@ typedef float slipid_real;
 typedef double slipid_real;
 #endif
 
-/* Hash of the robot's numbers, as robot.json has it. */
+/* Hash of the robot's parameters, the value of `numbers` in robot.json. */
 #define SLIPID_ROBOT "@ROBOT@"
 @DEFINES@
 
 @ABOUT@
 
-/* What the estimator keeps. */
+/* State of the estimator. */
 @ESTIMATOR@
 
-/* What the controller keeps. */
+/* State of the controller. */
 @CONTROLLER@
 
-/* What the sensors give; NaN where there is none. */
+/* Readings of the sensors; NaN for absent readings. */
 @READING@
 
-/* What is believed. */
+/* Output of the estimator. */
 @ESTIMATE@
 
-/* All that a robot keeps from step to step. */
+/* State of the whole control loop between two steps. */
 typedef struct {
   slipid_estimator estimator;
   slipid_controller controller;
-  slipid_real time; /* own time of a path that is followed [s] */
+  slipid_real time; /* time of the path that slipid_follow follows [s] */
 } slipid_state;
 
-/* Start at a pose: x, y [m], heading [rad]. */
+/* Set a state to that of a robot at rest at a pose: x, y [m], heading [rad]. */
 void slipid_init(slipid_state *state, const slipid_real pose[3]);
 
-/* One control period, dt after the last one [s]: slipid_observe, then slipid_command. */
+/* Compute one control step, a time dt [s] after the last one: slipid_observe, then slipid_command. */
 void slipid_step(slipid_state *state, const slipid_reading *reading, const slipid_real reference[6],
                  slipid_real dt, slipid_estimate *estimate, slipid_real command[SLIPID_WHEELS]);
 
-/* Start estimator and controller of a robot that stands at a pose: x, y [m], heading [rad]. */
+/* Set the states of estimator and controller for a robot at rest at a pose: x, y [m], heading [rad]. */
 @BEGIN@
 
-/* Make a reading one of no sensor at all; fill in what there is. */
+/* Set all readings to NaN; then fill in the readings of your sensors. */
 @NOTHING@
 
-/* Take in what the sensors give dt after the last call [s]: the estimator's step. */
+/* Step of the estimator: process readings a time dt [s] after the last call. */
 @OBSERVE@
 
-/* Wheel speeds to command [rad/s] for a reference, x, y [m], heading [rad] and their rates in the
-   world [m/s, m/s, rad/s]: the controller's step. */
+/* Step of the controller: compute wheel speeds to command [rad/s] for a reference, which is x, y [m],
+   heading [rad] and their rates in the world [m/s, m/s, rad/s]. */
 @COMMAND@
 
 @FOLLOWABOUT@
