@@ -119,10 +119,10 @@ def windows(
 def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
     """Return the variance of a single reading of each ammeter in each run [A^2].
 
-    It uses second differences d_t = x_(t-1) - 2 x_t + x_(t+1), which have six times the variance of
-    white noise and suppress smooth signals: of the variance of a ripple with a period of n readings
-    only the fraction (2 - 2 cos(2 pi / n))^2 / 6 remains, 6 % at n = 8. The std of d is taken from
-    the quantile of |d| at 68 %, so that jumps have little weight.
+    The estimate uses second differences d_t = x_(t-1) - 2 x_t + x_(t+1). Their variance is six
+    times that of white noise, whereas smooth signals are suppressed: a ripple with a period of n
+    readings keeps only the fraction (2 - 2 cos(2 pi / n))^2 / 6 of its variance, which is 6 % at
+    n = 8. The std of d is estimated by the 68 % quantile of |d|, so that jumps have little weight.
 
     Limits: ripple with a shorter period, or aliased by slow sampling, counts as noise; repeated
     readings, or smoothing in the motor driver, make the estimate too small; if the resolution of

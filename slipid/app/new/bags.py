@@ -52,7 +52,7 @@ class _TopicChannel:
     unit: str = ""
 
     def line(self) -> ConfigLine:
-        """Return the line of the config for the channel, commented out for an effort."""
+        """Return the config line of the channel; it is commented out if the field is an effort."""
         topic = self.topic
         inside = f"topic = {toml(topic.name)}"
         if self.field:
@@ -68,7 +68,7 @@ class _TopicChannel:
 def bags_in(path: Path) -> list[Path]:
     """Return the bags at or below a path, as a config names them.
 
-    A bag that is a rosbag2 folder is named by its metadata.yaml; other files in it are not listed.
+    A rosbag2 folder is named by its metadata.yaml; other files in the folder are not listed.
     """
     if path.is_file():
         return [path] if path.suffix in SUFFIXES or path.name == _METADATA else []

@@ -52,7 +52,8 @@ _FIT = ConfigBlock(
         'lengths_from = "poses"',
     ),
 )
-"""Table `[fit]` as a comment, which asks whether poses are in true metres: no log shows it."""
+"""Table `[fit]` as a comment, which asks whether poses are in true metres, since no log shows this.
+"""
 
 
 def _head(draft: ConfigDraft, name: str) -> tuple[str, ...]:
@@ -71,7 +72,7 @@ def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock
     given = robot.model_dump(exclude_none=True)
     if isinstance(robot, OmniDrive) and robot.roller_angle_deg == 90.0:
         del given["roller_angle_deg"]  # the default: ordinary omni wheels need no line for it
-    # The keys of the type of drive come first, those that all robots have after them.
+    # The keys of the type of drive come first; the keys that all robots have come after them.
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
     own = (key for key in given if key not in ("drive", *common))
     lines = []

@@ -79,7 +79,10 @@ def file_draft(
 
 
 def _units_row(one: FileStudy) -> int:
-    """Return the row of units, which the reader checks; 0 if a used column has no unit in it."""
+    """Return the row of units for the layout; 0 if there is none, or if a used column has no unit.
+
+    When logs are read, the units in this row are checked against the layout.
+    """
     used = [at for found in one.found for at in found.columns]
     return one.format.units_row if all(one.format.units[at] for at in used) else 0
 
@@ -196,7 +199,7 @@ def _unusable(found: FileChannel, run: RunStudy) -> dict[str, str] | None:
 
 
 def unit_of(one: FileStudy, found: FileChannel, run: RunStudy, robot: RobotAnswers) -> UnitGuess:
-    """Return a guess of the unit of a channel, whose name has no unit."""
+    """Return a guess of the unit of a channel whose columns do not name one."""
     channel = found.channel
     most = float(np.nanmax(np.abs(found.values)))
     if channel == "time":
@@ -240,7 +243,7 @@ def _pose_heading_range(run: RunStudy) -> float:
 def _heading_range(run: RunStudy) -> float:
     """Return the range of the heading, integrated from a run's gyro or commands [rad].
 
-    It is 0 without them.
+    The range is 0 if the run has neither gyro nor commands.
     """
     for one in run.all:
         rate = one.find("gyro", "twist_command_yaw")

@@ -43,7 +43,7 @@ LEAST_TRANSLATION = 0.02
 """Least fraction of translation in the predicted motion for which translations are compared [1]."""
 SAME_DATA = 1e-6
 """Relative difference between the wheels' angle and their integrated speed below which the angle
-was computed from the speed [1]."""
+must have been computed from the speed [1]."""
 
 _Range = tuple[float, float, float]
 """Least, usual and largest natural value of a ratio [1]."""
@@ -243,7 +243,7 @@ QUANTITIES: Mapping[str, ScaledQuantity] = {
     ),
     "command_twist": ScaledQuantity(
         "command_unit",
-        "the channel twist_command_x and twist_command_y",
+        "the pair of channels twist_command_x and twist_command_y",
         {"drive": 1.0},
         (1e3, 1e2, 10.0),
     ),
@@ -257,7 +257,7 @@ _BY_GEAR = ("wheel_gear", "wheel_turns", "command_wheels", "report")
 
 
 class ScaleCause(NamedTuple):
-    """A cause, that is, a quantity that is wrong by a factor, which explains the ratios.
+    """A quantity that is wrong by a factor, as a possible cause of ratios outside their ranges.
 
     Attributes:
         name: name of the quantity in `QUANTITIES`.

@@ -91,7 +91,7 @@ def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
 
 
 def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time column"]:
-    """Return the latest reading at each time of the clock; the first one before any reading."""
+    """Return the latest reading at each time of `clock`; earlier times get the first reading."""
     if signal.time is clock and not np.isnan(signal.values).any():
         return signal.values.copy()
     out = np.empty((len(clock), signal.values.shape[1]))

@@ -197,7 +197,7 @@ def test_errors_of_the_reader_are_questions(tmp_path):
     rows[100] += ",7"
     path.write_text("\n".join(rows) + "\n")
     _, config = proposed(path, **ROBOT)
-    assert any("the reader says" in q and "row 101" in q for q in config.questions)
+    assert any("reading fails" in q and "row 101" in q for q in config.questions)
 
 
 def test_the_unit_of_a_heading_beyond_a_turn_follows_from_the_turn_rate(tmp_path):
