@@ -161,8 +161,8 @@ def check(
 def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
     """Return the part of check.json about the logs.
 
-    It has the findings, the runs by floor, load set-up and session, the channels, the repairs made
-    when the logs were read, and the `skipped` logs.
+    This part has the findings, the runs by floor, load set-up and session, the channels, the
+    repairs made when the logs were read, and the `skipped` logs.
     """
     data = task.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}

@@ -143,10 +143,10 @@ class FitTask:
     def cutting_robot(self, near: Robot | None) -> Robot:
         """Return the robot for whose wheel radius and lag windows are cut.
 
-        It is the robot at the start of a fit. If a robot `near` an optimum is given whose lag
-        differs from that of the start by more than `RECUT_LAG_S`, the result has the lag of `near`,
-        because the wheel angle turned in a window is linear in the lag only near the lag for which
-        the window was cut.
+        The result is the robot at the start of a fit. If a robot `near` an optimum is given whose
+        lag differs from that of the start by more than `RECUT_LAG_S`, the result has the lag of
+        `near`, because the wheel angle turned in a window is linear in the lag only near the lag
+        for which the window was cut.
         """
         robot = Space(self.robot, self.choices).template
         if near is None or abs(float(near.camera.lag - robot.camera.lag)) <= RECUT_LAG_S:

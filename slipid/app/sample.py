@@ -122,7 +122,7 @@ def _refuse_mixed(fit: Fit) -> None:
 
 
 def _refuse_other_logs(fit: Fit, task: ConfigFitTask) -> None:
-    """Raise `DataError` if the logs are not those of the fit; it names the first that differs."""
+    """Raise `DataError` about the first log that differs from the logs of the fit, if any does."""
     then, now = dict(fit.runs), {log.name: log.sha256 for log in task.dataset.logs}
     for name in [*then, *now]:
         if then.get(name) != now.get(name):

@@ -251,10 +251,11 @@ def _mean(
     Each row is weighted by the time from the middle between it and the previous row to the middle
     between it and the next row. (A plain mean over the rows in a window would be biased, because
     its first row comes after the edge: while a robot speeds up, mean voltages would be too high.)
-    Between the readings of a slow meter the signal is taken as linear. If it really jumped from one
-    reading to the next at an unknown time in between, the mean over that time has an error whose
-    std is the difference of the two readings over sqrt(12); the returned variance is due to these
-    errors. Rows of telemetry stalls are left out, except in windows that have no other rows.
+    Between the readings of a slow meter the signal is assumed to be linear. If it really jumped
+    from one reading to the next at an unknown time in between, the mean over that time has an error
+    whose std is the difference of the two readings divided by sqrt(12); the returned variance is
+    due to these errors. Rows of telemetry stalls are left out, except in windows that have no other
+    rows.
 
     Args:
         time: times of the rows [s].

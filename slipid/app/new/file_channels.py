@@ -26,7 +26,7 @@ _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
 """Labels of wheels in the order in which the types of drive count wheels."""
 _QUATERNION = ("x", "y", "z", "w")
 _LEAST_TICKS = 50
-"""Magnitude above which whole numbers of a position are taken for ticks."""
+"""Magnitude above which whole numbers of a position are assumed to be ticks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +200,7 @@ def unnamed_channels(numbers: TableNumbers) -> Channels:
 
     def put(channel: str, *at: int) -> None:
         labels = tuple(str(k + 1) for k in range(len(at)))
-        doubt = (f"taken for {channel} by its numbers: is it?",)
+        doubt = (f"guessed from the numbers: is it {channel}?",)
         found.append(FileChannel(channel, at, labels, values[:, at], "", doubt))
 
     if time is not None:

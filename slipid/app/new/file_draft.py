@@ -90,7 +90,8 @@ def _units_row(one: FileStudy) -> int:
 def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
     """Return the lines of the layout about the times of rows.
 
-    They are about new runs in the file, repeated times, gaps, or the period if there is no time.
+    The lines are about new runs in the file, repeated times and gaps; or only about the period of
+    the rows, if the file has no time.
     """
     if one.clock is None:
         ask = "no column of time: how long is a row [s]?"
@@ -135,7 +136,7 @@ def _layout_settings(run: RunStudy, robot: RobotAnswers) -> list[ConfigLine]:
 def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
     """Return a remark about the ticks per turn that the reported speeds imply.
 
-    It is empty if the main file does not have both ticks and speeds.
+    The remark is empty if the main file has no speeds, or if they cannot be compared with the ticks.
     """
     speed = run.main.find(*reversed(SPEEDS))
     if speed is None or not speed.unit or run.main.clock is None:
@@ -160,7 +161,7 @@ def radius_hint(run: RunStudy, robot: RobotAnswers) -> dict[str, str]:
     radius = ratio / factor(unit, "rad/s")
     if not RADII[0] <= radius <= RADII[1]:
         return {}
-    ask = f"taken by default: measure it; by the poses it is about {radius:.2g}"
+    ask = f"default value: measure it; according to the poses it is about {radius:.2g}"
     return {"wheel_radius_m": ask}
 
 

@@ -78,7 +78,7 @@ class FileStudy:
         """Return the study without the channels in `names`, which come from another file."""
         kept = [one for one in self.found if one.channel not in names]
         again = sorted(one.channel for one in self.found if one.channel in names)
-        note = f"Also here, but taken from the other file: {', '.join(again)}."
+        note = f"Also here, but read from the other file: {', '.join(again)}."
         return replace(self, found=kept, notes=[*self.notes, note] if again else self.notes)
 
 

@@ -188,7 +188,7 @@ def _problem(error: DataError) -> str:
 
 
 def _read(draft: ConfigDraft, name: str, path: Path) -> Sequence[Log]:
-    """Return the runs in a file, which is read with the draft's layout of the given name.
+    """Return the runs in a file, read with the layout `name` of the draft.
 
     There are no runs if no section of the draft uses the layout.
 

@@ -285,7 +285,7 @@ def _unit_of_rate(factor: float) -> str:
         pi / 180: ": radians were taken for degrees",
         1 / (2 * pi): ": revolutions were taken for radians",
         2 * pi: ": radians were taken for revolutions",
-        1000.0: ": thousandths were taken for the whole",
+        1000.0: ": thousandths of the unit were taken for the whole unit",
     }
     return _unit_name(factor, names)
 

@@ -1,9 +1,10 @@
 """Interpretations of the logs: order and signs of the wheels' columns, and the axes of the poses.
 
 The declared interpretation is compared with candidates, which differ from it by single mistakes.
-The misfit of an interpretation is a sum of unexplained fractions, each from 0 to 1. They do not
-depend on the length of the motion, so that slip, which shortens it, does not count against the true
-interpretation. The compared channels contribute the following fractions of their motion:
+The misfit of an interpretation is a sum of unexplained fractions, each from 0 to 1. A fraction does
+not depend on the length of the motion, so that slip, which shortens the motion, does not count
+against the true interpretation. Each compared channel contributes the fraction of its motion that
+consists of:
 
     pose, and commanded twist   body increments along each axis that the wheels do not explain
     wheels                      rotations impossible for a rigid body (with more than three wheels)

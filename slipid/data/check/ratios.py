@@ -48,9 +48,9 @@ must have been computed from the speed [1]."""
 _Range = tuple[float, float, float]
 """Least, usual and largest natural value of a ratio [1]."""
 _WIDE: Mapping[str, _Range] = {
-    # The lower end is small because a robot may slip in place on carpet; it is used if commands
-    # confirm the motion of the wheels. The upper end allows for a camera scale that is wrong by an
-    # eighth.
+    # The lower end is small because a robot may slip in place on carpet. If no command confirms the
+    # motion of the wheels, `_UNVOUCHED` replaces this range. The upper end allows for a camera scale
+    # that is wrong by an eighth.
     "travel": (0.012, 0.8, 1.35),
     "turning": (0.35, 0.8, 1.35),
     # The upper ends are large because commands exceed the motion if brakes or limits act.
@@ -141,7 +141,7 @@ def _gyro(
 ) -> float | None:
     """Return the ratio of rotation by the gyro to that of the poses.
 
-    It is None if there is no gyro, or if gyro and heading have a correlation below 0.5.
+    The ratio is None if there is no gyro, or if gyro and heading have a correlation below 0.5.
     """
     if moved.gyro is None:
         return None
@@ -160,8 +160,8 @@ def _gyro(
 def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
     """Return the ratio of reported to encoder wheel speeds, and whether they are the same data.
 
-    They are the same data if the wheel angle is the integral of the reported speed. The ratio is
-    None in this case, if no speeds were reported, or if no wheel turns.
+    Both are the same data if the wheel angle is the integral of the reported speed. The ratio is
+    None in this case, and also if no speeds were reported or no wheel turns.
     """
     if "wheel_speed" not in data.channels:
         return None, False

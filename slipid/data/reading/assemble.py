@@ -126,8 +126,8 @@ def _angle(
 ) -> Float[np.ndarray, "time wheel"]:
     """Return the cumulative angle of each wheel [rad], 0 in the first row.
 
-    It is computed from the channel `name`: ticks, angles, or speeds, which are integrated. Without
-    such a channel (None) the result has no columns. Remarks are appended to the notes.
+    The angle is computed from the channel `name`: ticks, angles, or speeds, which are integrated.
+    If `name` is None, the result has no columns. Remarks are appended to the notes.
     """
     if name is None:
         return np.zeros((len(clock), 0))

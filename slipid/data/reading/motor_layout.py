@@ -11,8 +11,8 @@ from slipid.data.reading.units import converts
 from slipid.support.errors import DataError, bad_data, did_you_mean
 
 SHAFT_GEAR_RATIO = 10.0
-"""Gear ratio of the layout; it is fictitious, and lets a motor shaft turn ten times faster than the
-checks allow for a wheel."""
+"""Fictitious gear ratio of the layout, with which the checks allow a motor shaft to turn ten times
+faster than a wheel."""
 _CHANNELS = ("time", "voltage", "current", "motor_speed", "motor_angle", "duty", "bus_voltage")
 _INSTEAD = {"motor_speed": "motor_angle", "motor_angle": "motor_speed"}
 """Alternative channels: a channel is not searched for if its alternative is given."""

@@ -163,7 +163,7 @@ def test_files_without_names_are_read_by_position_with_questions(tmp_path):
     layout = layout_in(config)
     assert (layout["names_row"], layout["first_data_row"]) == (0, 1)
     assert layout["columns"]["wheel_ticks"]["columns"] == [4, 5]
-    assert sum("by its numbers: is it?" in q for q in config.questions) == 5
+    assert sum("guessed from the numbers: is it" in q for q in config.questions) == 5
 
 
 def test_four_wheels_are_put_in_the_order_of_the_drive(tmp_path):

@@ -30,7 +30,7 @@ ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
 
 
 class Edge(NamedTuple):
-    """Names of the frames of a transform, which is the pose of frame `child` in frame `parent`."""
+    """Names of the two frames of a transform, the pose of frame `child` in frame `parent`."""
 
     parent: str
     child: str
