@@ -136,7 +136,7 @@ def _layout_settings(run: RunStudy, robot: RobotAnswers) -> list[ConfigLine]:
 def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
     """Return a remark about the ticks per turn that the reported speeds imply.
 
-    The remark is empty if the main file has no speeds, or if they cannot be compared with the ticks.
+    The remark is empty if the main file has no speeds that can be compared with the ticks.
     """
     speed = run.main.find(*reversed(SPEEDS))
     if speed is None or not speed.unit or run.main.clock is None:

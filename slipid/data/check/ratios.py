@@ -49,8 +49,8 @@ _Range = tuple[float, float, float]
 """Least, usual and largest natural value of a ratio [1]."""
 _WIDE: Mapping[str, _Range] = {
     # The lower end is small because a robot may slip in place on carpet. If no command confirms the
-    # motion of the wheels, `_UNVOUCHED` replaces this range. The upper end allows for a camera scale
-    # that is wrong by an eighth.
+    # motion of the wheels, `_UNVOUCHED` replaces this range. The upper end allows for a camera
+    # scale that is wrong by an eighth.
     "travel": (0.012, 0.8, 1.35),
     "turning": (0.35, 0.8, 1.35),
     # The upper ends are large because commands exceed the motion if brakes or limits act.
