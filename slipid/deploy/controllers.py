@@ -24,9 +24,9 @@ class ControllerRow:
     """A combination of estimator and controller.
 
     Attributes:
-        observer: estimator: `encoder` (odometry without slip), `curve` (odometry with slip by
-            current, wheel by wheel) or `contact` (`slipid.Estimator`).
-        about: description for people.
+        observer: estimator: `encoder` (odometry without slip), `curve` (odometry with each wheel's
+            slip computed from its current) or `contact` (`slipid.Estimator`).
+        about: description for people, in the output of `slipid trial`.
         correction: torque correction of the 2021 paper, see `slipid.robot.controller.Controller`.
         law: function from a robot to a published control law that replaces the pose loop; None for
             the pose loop.
@@ -55,11 +55,15 @@ class ControllerRow:
 CONTROLLERS: Mapping[str, ControllerRow] = {
     "encoder": ControllerRow("encoder", "odometry from encoders, without slip"),
     "slip_odometry": ControllerRow("curve", "odometry corrected by slip over current (figure 5)"),
-    "paper_print": ControllerRow("curve", "and torque correction as printed", "paper_print"),
-    "paper_code": ControllerRow(
-        "curve", "and torque correction as in the authors' program", "paper_code"
+    "paper_print": ControllerRow(
+        "curve", "slip odometry and the torque correction as printed", "paper_print"
     ),
-    "torque": ControllerRow("curve", "and torque correction, corrected", "torque"),
+    "paper_code": ControllerRow(
+        "curve", "slip odometry and the torque correction as in the authors' program", "paper_code"
+    ),
+    "torque": ControllerRow(
+        "curve", "slip odometry and the torque correction without its two errors", "torque"
+    ),
     "contact": ControllerRow(
         "contact", "contact estimator, with tuned gains if they are better", tuned=True
     ),

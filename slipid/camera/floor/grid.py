@@ -91,7 +91,7 @@ class Rectified:
 def filled(polygon: Float[np.ndarray, "corner 2"], rows: int, columns: int) -> Mask:
     """Return a mask of the grid points in a polygon, whose corners are given as column and row."""
     mask = np.zeros((rows, columns), np.uint8)
-    # OpenCV takes corners as integers: in sixteenths, 4 fractional bits in the last argument below
+    # OpenCV takes corners as integers: give sixteenths, and 4 fractional bits as the last argument
     parts = 16
     corners = np.rint(np.clip(polygon, -1e6, 1e6) * parts).astype(np.int32)
     cv2.fillPoly(mask, [corners.reshape(-1, 1, 2)], 1, cv2.LINE_8, 4)

@@ -196,8 +196,8 @@ class FloorFilter(eqx.Module):
     def _remaining_std(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Return the remaining std of every floor's effects as a fraction of the whole std [1].
 
-        The whole std is the std without an effect table. It remains while wheels are on several
-        floors, since the table's estimates are for all wheels on one floor.
+        The whole std is the std without an effect table. While wheels are on several floors the
+        whole std remains, since the table's estimates are for all wheels on one floor.
         """
         alone = known[hypotheses_of(self.robot).uniform]
         share = alone / jnp.maximum(self.robot.rest @ under, 1e-12)
@@ -295,7 +295,11 @@ class FloorFilter(eqx.Module):
     def _after_floor_changes(
         self, old: FloorState, xi: Array, tick: TimeStep, mapped: Array | None
     ) -> tuple[Array, Array]:
-        """Return probabilities and relative poses after wheels may have changed floors."""
+        """Return probabilities and relative poses after wheels may have changed floors.
+
+        A change leads to the "unknown" floor with probability 0.05; while the floor is unknown, a
+        change leads back to the hypotheses with probability 0.2.
+        """
         known, unknown = jnp.maximum(old.belief[:-1], 1e-12), old.belief[-1]
         sure = jnp.sum(known)
         speed = length((known @ xi)[:2] / sure)
@@ -316,8 +320,8 @@ class FloorFilter(eqx.Module):
     def _changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
         """Return the belief after each wheel in turn may have changed its floor.
 
-        The new floor is drawn by the prior, given the floors under the other wheels. Columns of `p`
-        are the probability and its products with the relative pose.
+        The new floor is drawn from the prior, given the floors under the other wheels. The columns
+        of `p` are the probability and its products with the relative pose.
         """
         prior, none = self.prior(), jnp.zeros((1, p.shape[1]))
         for beside in hypotheses_of(self.robot).beside:
@@ -378,5 +382,5 @@ def _followed(
 
 
 def length(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:
-    """Return the length of a vector, with 1e-24 added under the root for a derivative at zero."""
+    """Return the length of a vector; 1e-24 under the root gives it a derivative at zero."""
     return jnp.sqrt(jnp.sum(v * v, axis=-1) + 1e-24)

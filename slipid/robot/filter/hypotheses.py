@@ -1,9 +1,9 @@
 """Hypotheses about the floors under all wheels of a robot.
 
 The number of assignments of floors to wheels grows as floors^wheels: 625 for four wheels on five
-floors. The edge of a floor is nearly straight on the scale of a robot, so going around the robot
-from wheel to wheel the floor changes at most twice: every hypothesis has one floor, or two floors
-with neighbouring wheels on each. That leaves 125 of the 625, and 21 of the 27 for three wheels on
+floors. The edge of a floor is nearly straight on the scale of a robot, so the floor changes at most
+twice from wheel to wheel around the robot: every hypothesis has one floor, or two floors with
+neighbouring wheels on each. That leaves 125 of the 625, and 21 of the 27 for three wheels on
 three floors. Three floors at once, where patches meet at a corner, are represented by the most
 similar hypothesis or by "unknown". A hypothetical floor (`slipid.robot.unseen`) is under all wheels
 or under none.
