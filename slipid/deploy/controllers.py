@@ -74,6 +74,7 @@ CONTROLLERS: Mapping[str, ControllerRow] = {
         "contact", "contact estimator with a gyro", tuned=True, gyro=True
     ),
 }
+"""Combinations of estimator and controller, keyed by the name that users give."""
 
 
 def control_loop_of(

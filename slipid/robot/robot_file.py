@@ -99,7 +99,8 @@ def _object(kind: Any, value: object, where: str) -> Any:
             raise ValueError(f"the field {before}{name} is missing")
     for name in value:
         if name not in names:
-            raise ValueError(f"{before}{name}: no such field; expected {', '.join(names)}")
+            known = ", ".join(names)
+            raise ValueError(f"{before}{name}: no such field; expected only these fields: {known}")
     return kind(**{name: typed(hints[name], value[name], f"{before}{name}") for name in names})
 
 

@@ -109,7 +109,7 @@ class TwinState(eqx.Module):
         wanted: set-point speeds of the wheels' speed control [rad/s].
         speed: wheel speeds [rad/s].
         angle: wheel angles [rad].
-        effect: present effect of every floor beyond its estimate, in units of its remaining std.
+        effect: present effect of every floor less its estimate, in units of the remaining std.
         toward: settled direction of travel, see `slipid.robot.filter.effects`.
         offset: error of the modelled currents that is constant in a run [A].
         drift: error of the modelled currents that is correlated over time [A].

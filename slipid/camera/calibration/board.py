@@ -181,6 +181,7 @@ class View:
             return True
         steps = np.unique(np.round(np.diff(np.unique(self.board_m)), 9))
         spread = np.linalg.svd(self.board_m - self.board_m.mean(0), compute_uv=False)
+        # with half of the corners on each of two neighbouring lines, the factor would be 0.5
         return bool(spread[1] < 0.4 * steps[steps > 0].min() * np.sqrt(len(self.pixels)))
 
 

@@ -207,7 +207,7 @@ def _updated(
     count = np.bincount(own, minlength=len(seeds.colours))
     # small surfaces get larger weights, so that all contribute to the illumination
     weight = 1 / np.sqrt(count[own])
-    weight[len(weight) - len(marked) :] *= 3
+    weight[len(weight) - len(marked) :] *= 3  # a marked cell certainly has its surface
     at, appearance = (
         positions(few.appearance.shape[:2])[cells],
         few.appearance.reshape(-1, 4)[cells],

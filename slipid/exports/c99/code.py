@@ -22,6 +22,7 @@ from slipid.robot.interface import Readings
 from slipid.robot.trajectory import Path
 
 C_TYPES = {**TYPES, "real": "slipid_real"}
+"""C type of each kind of number in slipid.h."""
 
 
 class Code:

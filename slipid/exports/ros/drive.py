@@ -29,6 +29,7 @@ LARGEST_DIFFERENCE = 0.05
 The difference is the largest error of a rim speed, as a fraction of the body's speed [1]; while the
 body turns on the spot, its speed is the speed of points on the base radius."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
+"""Names of the four wheels in the parameters of mecanum_drive_controller, in its order."""
 
 
 @dataclass(frozen=True)

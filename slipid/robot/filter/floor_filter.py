@@ -88,7 +88,7 @@ class BodyMotion(eqx.Module):
         known: probability of every hypothesis after this step, given that one of them is true.
         before: probability like `known`, but without the evidence of this step.
         under: probability of each floor under each wheel, given that one hypothesis is true.
-        jump: change of the pose beyond the mean twist, caused by late evidence [m, m, rad].
+        jump: change of the pose by late evidence, added to the motion by the twist [m, m, rad].
         correction: change of the mean twist caused by this step's evidence [m/s, m/s, rad/s].
     """
 
@@ -352,8 +352,8 @@ class FloorFilter(eqx.Module):
         """Return poses of the hypotheses relative to their mean, and the jump of the mean pose.
 
         Each hypothesis moves on from its own pose with its own twist, whose yaw rate is replaced by
-        the gyro's if there is a gyro. The jump is the change of the mean pose beyond the mean
-        twist, which late evidence on the floors causes.
+        the gyro's if there is a gyro. The jump is the change of the mean pose less the motion
+        by the mean twist; late evidence on the floors causes it.
         """
         xi = xi.at[:, 2].set(jnp.where(jnp.isfinite(turn), turn, xi[:, 2]))
         poses = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, tick.dt))
