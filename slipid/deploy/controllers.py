@@ -86,8 +86,8 @@ def control_loop_of(
 ) -> ControlLoop[eqx.Module]:
     """Return the control loop of a row for a robot.
 
-    If `row.tuned`, tuned gains are used if they are better than the gains set by hand, or if
-    `forced`. `floor` is used only if `row.mapped`.
+    Tuned gains are used only if `row.tuned` is True, and only if they are better than the gains set
+    by hand or `forced` is True. `floor` is used only if `row.mapped` is True.
 
     Raises:
         DataError: the row does not apply to the robot's wheels.

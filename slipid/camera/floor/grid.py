@@ -180,7 +180,7 @@ def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid:
 
 
 def _before_lens(camera: OverheadCamera, points: Float[np.ndarray, "row column 3"]) -> Mask:
-    """Return a mask of the points in front of the lens, near and within its angle of view.
+    """Return a mask of the points near the camera, in front of it and within its angle of view.
 
     All other points must be excluded, since the distortion of a lens is a polynomial that would map
     points far outside the image back into it.

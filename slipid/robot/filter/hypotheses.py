@@ -19,7 +19,7 @@ from jaxtyping import Bool, Int
 from slipid.robot.deployed import RobotArrays
 
 MOST_CHANGES = 2
-"""Largest number of floor changes from wheel to wheel when going around the robot."""
+"""Largest number of floor changes from wheel to wheel around the robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,5 +74,5 @@ def _hypotheses(around: tuple[int, ...], unseen: tuple[bool, ...], changes: int)
 
 
 def _changes(row: tuple[int, ...], around: tuple[int, ...]) -> int:
-    """Return the number of floor changes from wheel to wheel when going around the robot."""
+    """Return the number of floor changes from wheel to wheel around the robot."""
     return sum(row[a] != row[b] for a, b in zip(around, around[1:] + around[:1], strict=True))
