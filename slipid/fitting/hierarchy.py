@@ -107,9 +107,9 @@ def extrapolation(
     regions; the variances of individual run effects and of the noise, which other runs do not
     predict, are kept. The factor is 1 if at least 90 % of the end points already lie in their
     regions, or if there are fewer than three sectors or fewer than `LEAST_RUNS` runs. The factor is
-    needed for two reasons: maximum likelihood fits the variances to differences of neighbouring
-    runs, so that the variances are too small if the model is wrong on a larger scale; and the fit
-    down-weights outliers, which occur in forecast runs as well.
+    needed for two reasons: maximum likelihood fits the variances to differences between runs in
+    neighbouring directions, so that the variances are too small if the model is wrong over a wider
+    range of directions; and the fit down-weights outliers, which occur in forecast runs as well.
 
     Args:
         axes: results of `axis_effects`.
@@ -358,7 +358,7 @@ def pooled_stds(precision: Square, z: Search, objective: Objective, log_v: Varia
             - np.log(np.diag(root)).sum()
             - len(at) * np.log(part * typical)
             - 0.5 * part**2
-            # The grid is geometric: a candidate represents an interval as wide as its std allows.
+            # The grid is geometric: the interval around a candidate is proportional to its std.
             + np.log(part)
         )
     weight = np.exp(np.array(log) - max(log))

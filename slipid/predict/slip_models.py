@@ -54,7 +54,7 @@ class FloorModels:
         return {key: m.coefficients for key, m in self.fitted.items() if m.coefficients is not None}
 
     def with_state(self, state: Mapping[str, np.ndarray]) -> "FloorModels":
-        """Return the models with coefficients from `state`, the property of other such models."""
+        """Return the models with coefficients in the form of the property `state`."""
         models = {
             k: replace(self.fitted.get(k, self.model), coefficients=v) for k, v in state.items()
         }

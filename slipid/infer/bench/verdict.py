@@ -215,7 +215,7 @@ def _remedy(paths: Sequence[str], has_voltage: bool) -> str:
 
 
 def _too_slow(f: MotorFit) -> dict[str, str]:
-    """Return sentences on parameters whose time constants are too short, keyed by path."""
+    """Return sentences on time constants that are too short for the rows, keyed by parameter."""
     m, rows, slow = f.motor, f.period, {}
     if not f.has_voltage:
         return {}

@@ -110,7 +110,7 @@ def drawn_variances(
 
     The log variances depend little on the parameters of the model. They are drawn from a Gaussian
     around the fit with their expected information. Only the variance of the load biases is drawn
-    from its posterior on a grid, which is not Gaussian since there are few biases.
+    on a grid: its posterior is not Gaussian, since there are few biases.
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
