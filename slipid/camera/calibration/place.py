@@ -69,7 +69,7 @@ class FloorFit:
 
     @property
     def off_mm(self) -> Float[np.ndarray, "point 2"]:
-        """x and y computed from the points' pixels and heights, less the given x and y [mm]."""
+        """Positions computed from the points' pixels and heights, less the given x and y [mm]."""
         off = [
             self.camera.on_plane(pixel, float(place[2])) - place[:2]
             for pixel, place in zip(self.points.pixels, self.points.places, strict=True)

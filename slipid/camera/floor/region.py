@@ -310,7 +310,7 @@ def _marked(region: FloorRegion, marked: Places, k: int) -> Int[np.ndarray, "poi
     off = ~((cells >= 0) & (cells < [grid.rows, grid.columns])).all(axis=1)
     inside = cells.clip(0, [grid.rows - 1, grid.columns - 1])
     off |= ~region.visible[inside[:, 0], inside[:, 1]]
-    _refuse(source, given[off], k, "not visible, outside the region, on a mask, or on a robot")
+    _refuse(source, given[off], k, "not visible, outside the region, on a mask or on a robot")
     return inside
 
 

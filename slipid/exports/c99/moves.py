@@ -133,7 +133,7 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
         raise NoFormError("batches of indices are not supported")
     if params["mode"] == lax.GatherScatterMode.FILL_OR_DROP:
-        raise NoFormError("a fill value for indices out of range is not supported")
+        raise NoFormError("indices out of range give a fill value, which is not supported")
     memory = contiguous(builder, whole)
     batch = [d for d in range(len(out.shape)) if d not in numbers.offset_dims]
     kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]
