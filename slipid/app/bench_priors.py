@@ -64,9 +64,7 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
         choices.append(Choice(f"motor.{name}", prior_mean=times * mean, prior_std=times * std))
     lines = [f"motor from {path}: {', '.join(c.pattern for c in choices) or 'nothing'}"]
     if left_out := [name for name in NAMES if name not in known]:
-        lines.append(
-            f"not taken from {path}, since not identified there: {', '.join(left_out)}"
-        )
+        lines.append(f"not taken from {path}, since not identified there: {', '.join(left_out)}")
     return choices, lines
 
 
