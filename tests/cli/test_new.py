@@ -77,7 +77,7 @@ def test_a_log_is_looked_into(tmp_path):
     result = invoke("new", "--from", tmp_path / "logs", "--out", out, "--force")
     assert result.exit_code == 0, result.stderr
     assert '? drive: two drives: differential, or "skid"' in result.stdout
-    assert "by the poses it is about 0.1" in result.stdout
+    assert "according to the poses it is about 0.1" in result.stdout
 
 
 def test_nothing_to_look_into_is_2(tmp_path):

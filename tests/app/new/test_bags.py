@@ -154,7 +154,7 @@ def test_currents_in_messages_of_an_unknown_type_are_proposed_with_a_question(tm
     assert layout["topics"]["current"] == {"topic": "/motors", "field": "currents", "unit": "A"}
     said = [q for q in config.questions if q.startswith(("current:", "voltage:"))]
     assert len(said) == 2
-    assert all("by the name of the field" in q for q in said)
+    assert all("from the name of the field" in q for q in said)
     assert "motor.resistance" in tomllib.loads(config.text)["parameters"]
     read = runs_of(bag, declared_bag_layout(layout, "mine"))
     np.testing.assert_allclose(read[0].signals["voltage"].values, 6.0)
