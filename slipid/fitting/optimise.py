@@ -1,4 +1,4 @@
-"""Maximum a posteriori fit, which alternates Student-t weights, numbers and noise variances."""
+"""Maximum a posteriori fit, which alternates Student-t weights, parameters and noise variances."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -78,7 +78,7 @@ def optimise(
             argument only, so that they share compiled functions.
         start: state to continue from instead of the staged start.
         most_rounds: largest number of rounds.
-        tolerance: the fit stops after a round in which every fitted number changed by less than
+        tolerance: the fit stops after a round in which every fitted parameter changed by less than
             this many posterior stds, and every log variance by less than three times as much.
         tell: function called after every round, for progress and checkpoints.
         free: 1 for coordinates that may change from the start, 0 for fixed ones (free,).
@@ -111,11 +111,11 @@ def one_round(
     steps: int,
     scoring: int,
 ) -> FitState:
-    """Return the state after one round: weights, then numbers, then variances.
+    """Return the state after one round: weights, then parameters, then variances.
 
     Args:
         mask: 1 for coordinates that may move, 0 for fixed ones.
-        steps: largest number of solver steps of the numbers.
+        steps: largest number of solver steps of the parameters.
         scoring: number of scoring steps of the variances.
     """
     objective, log_v = problem.objective, jnp.asarray(state.log_variance)
@@ -149,16 +149,14 @@ def one_round(
     for _ in range(scoring):
         log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), voltage)
         last, voltage = voltage, problem.voltage_information(z, log_v, motor_force)
-        if (
-            last is not None and voltage is not None
-        ):  # Voltage residuals are divided by their noise.
+        # The voltage residuals are divided by a spread that depends on log_v, which has just changed.
+        if last is not None and voltage is not None:
             scale = jnp.sqrt(voltage.share / last.share)
             residual = residual | {"voltage": voltage.residual}
             both = scale[:, :, None] * scale[:, None, :]
             spread = spread | {"voltage": spread["voltage"] * both}
-    if (
-        voltage is not None and scoring
-    ):  # A changed noise does not merely rescale the derivative by R.
+    # A changed noise does more than rescale the derivative with respect to R: it is computed anew.
+    if voltage is not None and scoring:
         electric = problem.electric(z, log_v)
         whole, jacobian, *_ = linear(objective, jnp.asarray(z), electric, near)
     information = np.asarray(problem.precision(jacobian, log_v, keep))
@@ -186,9 +184,9 @@ def one_round(
 def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], None]) -> FitState:
     """Return a start for the joint fit: motor by regression, then each floor from several starts.
 
-    While all other numbers are fixed, floors have no number in common, so that one fit in which
-    only the floors' numbers may move fits each floor independently. The start with the least loss
-    is chosen floor by floor.
+    While all other parameters are fixed, floors have no parameter in common, so that one fit in
+    which only the floors' parameters may move fits each floor independently. The start with the
+    least loss is chosen floor by floor.
     """
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)
@@ -206,18 +204,14 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
-        for steps in (
-            15,
-            6,
-            6,
-        ):  # The damping of the solver starts at 1, far below the scale of the problem.
+        # Many steps at first, since the damping starts at 1, far below the scale of the problem.
+        for steps in (15, 6, 6):
             state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
         found = problem.whitening(residual, state.log_variance, problem.full_weight)
-        cost = -np.log(
-            np.asarray(found.weight["motion"])
-        )  # loss per segment, up to a factor and an offset
+        # the loss of each segment, up to a factor and an offset
+        cost = -np.log(np.asarray(found.weight["motion"]))
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
             if mine < best[number]:
@@ -270,7 +264,7 @@ class RoundInputs(eqx.Module):
 
 
 class LinearisedResiduals(NamedTuple):
-    """Whitened residuals of all blocks and of the prior, their derivative by the step, and twists.
+    """Whitened residuals of all blocks and of the prior after a step of the solver.
 
     Attributes:
         residual: whitened residuals.

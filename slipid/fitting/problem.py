@@ -1,4 +1,4 @@
-"""Posterior of a robot's numbers given windows of its runs, compiled once per shape of windows."""
+"""Posterior of a robot's parameters given windows of its runs, compiled once for each shape."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -100,8 +100,8 @@ class FitState:
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    Currents and voltages do not change the numbers that motion determines (a "cut" posterior): the
-    torque scale is estimated from currents given the motion, and the errors of the motion are
+    Currents and voltages do not change the parameters that motion determines (a "cut" posterior):
+    the torque scale is estimated from currents given the motion, and the errors of the motion are
     propagated. Otherwise a motor friction model that is accurate to 5 % of the current would
     overrule forces that motion determines to 1 %.
 
@@ -170,7 +170,7 @@ class Problem:
     def carried_over(self, state: FitState, of: "Problem") -> FitState:
         """Return a state of another problem as a state of this one.
 
-        Both problems have the same fitted numbers. Variances are matched by name; those that the
+        Both problems have the same fitted parameters. Variances are matched by name; those that the
         other problem does not have start at their typical values.
         """
         known = dict(zip(of.noise.names, state.log_variance, strict=True))
@@ -232,7 +232,7 @@ class Problem:
     def loss(
         self, z: Vector, log_v: Vector, keep: Vector, at: "WeighedResiduals", e: lk.ElectricNoise
     ) -> float:
-        """Return minus the log posterior of numbers and variances, up to a constant.
+        """Return minus the log posterior of parameters and variances, up to a constant.
 
         Args:
             at: weighted residuals at z and log_v.
@@ -246,7 +246,7 @@ class Problem:
         return nll + 0.5 * float(np.sum(deviation**2)) + 0.5 * float(np.sum(spread**2))
 
     def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
-        """Return the noise that predictions of voltages depend on, at given numbers, variances."""
+        """Return the noise that predictions of voltages depend on, at given values."""
         return _electric(self.objective, z, log_v)
 
     def voltage_information(
@@ -306,9 +306,9 @@ class GivenMotion(eqx.Module):
     """Motion from which currents and voltages are predicted while the search vector changes.
 
     Attributes:
-        applies: True if electric residuals depend on electric numbers alone, given this motion;
-            False if they depend on all numbers at once.
-        z: search vector from which the other numbers are taken.
+        applies: True if electric residuals depend on electric parameters alone, given this motion;
+            False if they depend on all parameters at once.
+        z: search vector from which the other parameters are taken.
         motor_force: motor forces at z [mu m g].
     """
 
@@ -325,7 +325,7 @@ class Twists(NamedTuple):
     Attributes:
         steady: twists of the windows on one floor.
         multi_floor: twists of the windows of runs over several floors, None without such runs.
-        electric: the same with the electric numbers of `GivenMotion` replaced.
+        electric: the same with the electric parameters of `GivenMotion` replaced.
     """
 
     steady: lk.NearTwists
@@ -392,8 +392,8 @@ def linear_given(
         out |= lk.electric_residuals(electrical, batch, force, electric)
         twists = Twists(p.twist, None, None)
         if (of := objective.multi_floor) is not None:
-            # friction is an electric number that changes the motion of runs over several floors, so
-            # that their currents need a prediction of their own
+            # friction is an electric parameter that changes the motion of runs over several floors,
+            # so that their currents need a prediction of their own
             mine = lk.predict(robot, of.batch, near.multi_floor)
             theirs = lk.predict(electrical, of.batch, near.electric)
             out |= of.residuals(electrical, theirs)
@@ -466,7 +466,7 @@ def log_jacobian(
 
 @eqx.filter_jit
 def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
-    """Return every window's body twist (segment, window, 3) and its derivative by z (.., free)."""
+    """Return every window's body twist (segment, window, 3) and its derivatives (.., free)."""
     return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
 
 

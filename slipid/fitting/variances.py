@@ -1,8 +1,8 @@
 """Student-t weights of residuals at given variances, and variances estimated by Fisher scoring.
 
 The residuals of a segment have a multivariate Student-t distribution with the scale matrix V of
-`noise`. The restricted likelihood of the variances accounts for the fact that the model's numbers
-were fitted to the same residuals (Patterson and Thompson 1971, Biometrika 58(3)).
+`noise`. The restricted likelihood of the variances accounts for the fact that the parameters were
+fitted to the same residuals (Patterson and Thompson 1971, Biometrika 58(3)).
 """
 
 from typing import Any, NamedTuple
@@ -50,7 +50,7 @@ class Objective(eqx.Module):
     """Data and priors of a fit, as an argument of compiled functions.
 
     Attributes:
-        space: free numbers and their prior.
+        space: free parameters and their prior.
         batch: runs on one floor each.
         multi_floor: runs over several floors, None if there are none.
         blocks: covariance components of every block.
@@ -59,7 +59,7 @@ class Objective(eqx.Module):
         scored: True for variances that `scoring_step` estimates; those of run, shared and session
             effects and of load biases are estimated in `slipid.fitting.hierarchy`.
         pooled: index of the variance that is the prior variance of the space's pooled coordinates.
-        joint: True if no currents are logged, so that all numbers are estimated from motion.
+        joint: True if no currents are logged, so that all parameters are estimated from motion.
     """
 
     space: Space
@@ -99,7 +99,7 @@ class VoltageInformation(NamedTuple):
     Attributes:
         residual: voltage residual, divided by `likelihood.voltage_spread` [V].
         share: ratio of the voltmeter's variance to the whole variance of the undivided residual.
-        slope: derivative of the log likelihood by the scatter of the true current.
+        slope: derivative of the log likelihood with respect to the scatter of the true current.
         information: expected information about that scatter.
         steeper: excess of the loss's curvature by the log of the voltage noise over its expected
             value; it is large where other variances explain the residuals.
@@ -202,9 +202,9 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
     """Return the information of p(motion | motion data) p(electric | motion, all data).
 
     If wheels stand on several floors, motion depends on their friction, which is one of the
-    electric numbers `e`. The first factor marginalises friction as if currents contained no
+    electric parameters `e`. The first factor marginalises friction as if currents contained no
     information about it, although the estimated motion does use the friction from currents. The
-    intervals of the motion numbers are therefore somewhat too wide there.
+    intervals of the motion parameters are therefore somewhat too wide there.
     """
     first = of_motion - _schur_term(of_motion, e)
     motion = ~e[:, None] & ~e[None, :]
@@ -220,7 +220,7 @@ def _schur_term(information: Array, e: Array) -> Array:
 
 @eqx.filter_jit
 def fitted_covariance(objective: Objective, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
-    """Return the residuals' covariance due to fitted numbers and shared effects (segment, m, m).
+    """Return the residuals' covariance due to fitted parameters and shared effects (segment, m, m).
 
     The Jacobian is by the search vector, at fixed shared effects; their dependence on the search
     vector is added here.

@@ -161,7 +161,7 @@ class Friction(eqx.Module):
         return self.top * self._slope() + self.viscosity
 
     def by_speed(self) -> Array:
-        """Return the derivative by the speed at a constant activity."""
+        """Return the derivative with respect to the speed at a constant activity."""
         if self.beside is None:
             return self._top_slope() / self.onset + self.viscosity
         return self.top * (self._slope() + self._slope_change() * self.speed**2) + self.viscosity
@@ -173,7 +173,7 @@ class Friction(eqx.Module):
         return self.top * self._slope_change() * self.speed * self.beside
 
     def by_activity(self) -> Array:
-        """Return the derivative by the wheel's activity at a constant speed."""
+        """Return the derivative with respect to the wheel's activity at a constant speed."""
         return -(self._top_slope() / self.onset) * (self.speed / self.onset) * self.ratio
 
     def _top_slope(self) -> Array:

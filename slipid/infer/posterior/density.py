@@ -1,6 +1,6 @@
 """Log posterior of many walkers at once for samplers, with the same objective as the fit.
 
-A coordinate is a free number of the search space. Variances and the weights of runs keep their
+A coordinate is a free parameter of the search space. Variances and the weights of runs keep their
 fitted values, and shared effects are marginalised, so that the density is that of nonlinear least
 squares,
 
@@ -12,8 +12,8 @@ coordinates and have others of their own, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
 
-and moves of the numbers of several floors can be proposed in one evaluation and accepted floor by
-floor.
+and moves of the parameters of several floors can be proposed in one evaluation and accepted floor
+by floor.
 
 Electric numbers are drawn for every draw of the motion. Gauss-Newton steps find their most likely
 values given the motion, and proposals come from a Student t around them, whose tails cover those
@@ -41,10 +41,10 @@ Result = TypeVar("Result")
 
 
 class HeldMotion(NamedTuple):
-    """Motion of each walker, given which its electric numbers are drawn.
+    """Motion of each walker, given which its electric parameters are drawn.
 
     Attributes:
-        z: search vector with the walker's numbers of the motion.
+        z: search vector with the walker's parameters of the motion.
         motor_force: contact forces that the motors work against [mu m g].
     """
 
@@ -60,10 +60,10 @@ class _Residuals(NamedTuple):
 
 
 class Density:
-    """Log posterior of a part of a problem's numbers, with the other numbers as fitted.
+    """Log posterior of a part of a problem's parameters, with the other parameters as fitted.
 
     If currents are logged, the part EVERYTHING has the likelihoods of all residuals but is not the
-    posterior, in which currents do not change the numbers of the motion.
+    posterior, in which currents do not change the parameters of the motion.
 
     Attributes:
         structure: index of each coordinate in the search vector.
@@ -227,7 +227,7 @@ def _explained(posterior: EffectPosterior, white: Float[Array, "segment m"]) -> 
 _STEPS, _PROPOSALS = 4, 16
 """Numbers of Gauss-Newton steps and of proposals for every draw of the motion."""
 _DEGREES = 5.0
-"""Degrees of freedom of the Student t from which electric numbers are proposed."""
+"""Degrees of freedom of the Student t from which electric parameters are proposed."""
 _SCALE_RATIO = 1.15
 """Ratio of the scale of the proposals to that of the Gaussian around the most likely values."""
 
@@ -239,15 +239,15 @@ def electric_given_motion(
     x: Float[np.ndarray, "ensemble draw size"],
     seed: int,
 ) -> tuple[Float[np.ndarray, "ensemble draw size"], Bool[np.ndarray, "draw proposal"]]:
-    """Return draws of the electric numbers, one for every draw of the motion.
+    """Return draws of the electric parameters, one for every draw of the motion.
 
     The second result is a mask of the accepted proposals.
 
     Args:
         first: density of the motion.
-        second: density of the electric numbers given the motion.
+        second: density of the electric parameters given the motion.
         covariance: Laplace covariance of the search vector; Gauss-Newton steps start at its
-            regression of electric numbers on those of the motion.
+            regression of electric parameters on those of the motion.
         x: draws of the motion.
         seed: seed of the proposals.
     """
