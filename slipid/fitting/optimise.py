@@ -149,7 +149,7 @@ def one_round(
     for _ in range(scoring):
         log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), voltage)
         last, voltage = voltage, problem.voltage_information(z, log_v, motor_force)
-        # The voltage residuals are divided by a spread that depends on log_v, which has just changed.
+        # The spread that divides voltage residuals depends on log_v, which has just changed.
         if last is not None and voltage is not None:
             scale = jnp.sqrt(voltage.share / last.share)
             residual = residual | {"voltage": voltage.residual}
