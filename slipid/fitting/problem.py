@@ -325,7 +325,7 @@ class Twists(NamedTuple):
     Attributes:
         steady: twists of the windows on one floor.
         multi_floor: twists of the windows of runs over several floors, None without such runs.
-        electric: the same with the electric parameters of `GivenMotion` replaced.
+        electric: the same twists for the robot from which currents are predicted.
     """
 
     steady: lk.NearTwists
@@ -359,7 +359,7 @@ class ResidualsAt(NamedTuple):
 def linear(
     objective: Objective, z: Vector, electric: lk.ElectricNoise, near: Twists | None = None
 ) -> ResidualsAt:
-    """Return residual blocks, their Jacobians, and the forces of every motor.
+    """Return the residuals at a search vector, with electric residuals that depend on all of it.
 
     `near` holds the twists at a search vector close to z, which make the root finder faster.
     """
@@ -372,7 +372,7 @@ def linear(
 def linear_given(
     objective: Objective, z: Vector, electric: lk.ElectricNoise, given: GivenMotion, near: Twists
 ) -> ResidualsAt:
-    """Return residual blocks, their Jacobians, and the forces of every motor.
+    """Return the residuals at a search vector, given the motion that electric residuals assume.
 
     Both kinds of electric residuals are compiled together: to compile them apart would take longer
     than a whole fit to few runs.
@@ -401,33 +401,33 @@ def linear_given(
             twists = Twists(p.twist, mine.twist, theirs.twist)
         return out, ResidualsAt(out, {}, force, twists)
 
-    direction = np.arange(space.size) if objective.multi_floor else _directions(space)
+    tangent = np.arange(space.size) if objective.multi_floor else _tangents(space)
 
-    def along(change: Array) -> tuple[Blocks, ResidualsAt]:
+    def changed(change: Array) -> tuple[Blocks, ResidualsAt]:
         return jax.jvp(blocks, (jnp.asarray(z),), (change,), has_aux=True)[1:]
 
-    changes = (np.arange(direction.max(initial=-1) + 1)[:, None] == direction).astype(float)
-    slopes, found = jax.vmap(along, out_axes=(-1, None))(changes)
+    changes = (np.arange(tangent.max(initial=-1) + 1)[:, None] == tangent).astype(float)
+    slopes, found = jax.vmap(changed, out_axes=(-1, None))(changes)
     if not objective.multi_floor:
-        concerns = _concerns(space, batch)[:, None]
-        slopes = {k: jnp.where(concerns, s[..., direction], 0.0) for k, s in slopes.items()}
+        depends = _dependence(space, batch)[:, None]
+        slopes = {k: jnp.where(depends, s[..., tangent], 0.0) for k, s in slopes.items()}
     return found._replace(jacobian=slopes)
 
 
-def _directions(space: Space) -> Int[np.ndarray, " free"]:
-    """Return the index of the direction in which the derivative is taken for each coordinate.
+def _tangents(space: Space) -> Int[np.ndarray, " free"]:
+    """Return, for each coordinate, the number of the tangent that differentiates it.
 
-    A segment is on one floor, with one load set-up, in one session. Coordinates that differ only in
-    these are changed together: for each segment, the derivative is that of the one coordinate that
-    concerns it. Source: Curtis, Powell and Reid 1974, IMA J. Appl. Math. 13(1).
+    Coordinates of one quantity on different floors, load set-ups or sessions share a tangent: every
+    segment depends on one of them only, so that one derivative gives all their columns of the
+    Jacobian. Source: Curtis, Powell and Reid 1974, IMA J. Appl. Math. 13(1).
     """
     of = [(e.quantity, k) for e in space.free for k in range(e.coordinates)]
     index = {key: number for number, key in enumerate(dict.fromkeys(of))}
     return np.array([index[key] for key in of], int)
 
 
-def _concerns(space: Space, batch: lk.Batch) -> Bool[Array, "segment free"]:
-    """Return True for the coordinates of a segment's floor, load set-up, session, or of all."""
+def _dependence(space: Space, batch: lk.Batch) -> Bool[Array, "segment free"]:
+    """Return True where the residuals of a segment may depend on a coordinate."""
     tree = space.template
     out = jnp.ones((len(batch.surface), space.size), bool)
     for label, names, of in (

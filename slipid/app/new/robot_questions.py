@@ -16,7 +16,7 @@ Its arguments are the question, the default, and a message about what was wrong 
 answer (empty at first).
 """
 RobotOptions = Mapping[str, str]
-"""Texts of the command-line options that describe a robot, by the names of `RobotAnswers`."""
+"""Texts of the command-line options that describe a robot, keyed by attribute of `RobotAnswers`."""
 _SECTION: TypeAdapter[Wheels] = TypeAdapter(Annotated[Wheels, Field(discriminator="drive")])
 
 

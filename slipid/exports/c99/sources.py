@@ -88,7 +88,7 @@ class Sources:
         return sum(self._ready_cell(row) is not None for row in flat)
 
     def _ready_cell(self, row: np.ndarray) -> Cell | None:
-        """Return the cell of a source whose lanes are the elements with indices `row`, or None."""
+        """Return the cell of a source whose lane k is the element with index `row[k]`, or None."""
         source, _ = self._source(int(row[0]))
         if not isinstance(source, Array) or source.axis is None or source.lanes != len(row):
             return None
@@ -114,7 +114,7 @@ class Sources:
         return At(cell.memory, cell.offset + cell.stride * lane, index=cell.index)
 
     def row(self, row: np.ndarray) -> Cell:
-        """Return a cell whose lanes are the elements with indices `row`."""
+        """Return a cell that a loop can read: its lane k is the element with index `row[k]`."""
         ready = self._ready_cell(row)
         if ready is not None:
             return ready
