@@ -5,7 +5,8 @@ Every name below is loaded at its first use: importing slipid loads and changes 
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # type checkers take it as True; importing it would load `typing`
+# type checkers treat this name as True; importing it from `typing` would load that module
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from slipid.api.camera import track as track
     from slipid.api.fit import Prior as Prior

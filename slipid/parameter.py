@@ -25,18 +25,19 @@ Numbers = Array | np.ndarray
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Declaration:
-    """Unit, bounds and prior of a parameter, the same on all floors, load set-ups and sessions.
+    """Unit, bounds and prior of a parameter, common to all floors, load set-ups and sessions.
 
     Attributes:
         unit: unit in the notation of pint, "1" for a dimensionless number.
         symbol: symbol in the equations.
         start: value that is used if nothing else is known [unit].
-        lower: lower bound; without `upper`, the search space is the logarithm of value - lower.
-        upper: upper bound; with both bounds, the search space is the log-odds of
+        lower: lower bound; if there is no upper bound, the search space is the logarithm of
+            value - lower.
+        upper: upper bound; if there are both bounds, the search space is the log-odds of
             (value - lower) / (upper - lower).
         spread: default std of the prior in the search space: a log-std if the space is logarithmic,
             in [unit] if there are no bounds.
-        free: True if the parameter is fitted unless the user says otherwise.
+        free: True if the parameter is fitted unless a `Choice` of the user fixes it.
         shares: True if the elements of the array are positive fractions that sum to one.
         deviation: True if the elements of the array sum to zero and represent effects missing in
             the model; their common std is estimated from the data, up to about `spread`.
@@ -66,11 +67,11 @@ class Declaration:
 
     @property
     def constrained(self) -> bool:
-        """True if the sum of the elements is given, so that n of them have n - 1 coordinates."""
+        """True if the sum of the elements is given: n elements then have n - 1 coordinates."""
         return self.shares or self.deviation
 
     def broken_rule(self, x: np.ndarray) -> str | None:
-        """Return the rule that the values `x` break, as text, or None if they are valid."""
+        """Return the rule that the values `x` break, as a string; None if the values are valid."""
         if self.deviation:
             kept, rule = abs(x.sum()) < 1e-6, "numbers that sum to 0"
         elif self.shares:
@@ -108,7 +109,10 @@ class Declaration:
         return self.lower + (self.upper - self.lower) * _sigmoid(z)
 
     def slope(self, value: Any) -> Any:
-        """Return d (SI value) / d (search coordinate) at SI values, if not `constrained`."""
+        """Return the derivative of SI values with respect to their search coordinates.
+
+        Arguments are SI values of a parameter that is not `constrained`.
+        """
         if math.isinf(self.lower) and math.isinf(self.upper):
             return np.ones_like(value)
         if math.isinf(self.upper):
@@ -182,7 +186,7 @@ class Entry:
         quantity: the path without the surface, load set-up or session: `surface.friction`.
         declaration: unit, bounds and prior.
         leaf: attribute names from the root to the array.
-        index: position on the array's leading axis, None for the whole array.
+        index: index on the array's leading axis, None for the whole array.
         size: number of elements.
         surface, load, session: label to which the parameter belongs, None for a parameter common to
             all labels.
@@ -233,9 +237,9 @@ class Entry:
 def entries(tree: Any, prefix: str = "", leaf: tuple[str, ...] = ()) -> Iterator[Entry]:
     """Yield every declared parameter of an equinox module and its children, in declared order.
 
-    A child module with a static tuple `labels` is a stack along the leading axis of its arrays: its
-    paths read `<field>.<label>.<name>`. A key `path` in the metadata of a field replaces the
-    field's name in paths (`surface` for `surfaces`).
+    A child module with a static tuple `labels` has one element per label on the leading axis of its
+    arrays; the paths of these elements read `<field>.<label>.<name>`. A key `path` in the metadata
+    of a field replaces the field's name in paths (`surface` for `surfaces`).
     """
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)

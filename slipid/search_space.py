@@ -131,7 +131,7 @@ class Space(eqx.Module):
 
     @property
     def names(self) -> list[str]:
-        """One name per coordinate: the path of its parameter, with an index if that has several."""
+        """One name per coordinate: its parameter's path, with an index if there are several."""
         return [
             e.path if e.coordinates == 1 else f"{e.path}[{k + 1}]"
             for e in self.free

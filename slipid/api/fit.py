@@ -54,9 +54,9 @@ def fit(
     Args:
         runs: runs from `read_runs`, each on one floor.
         robot: robot that drove the runs, such as `Robot.omni(...)`.
-        priors: priors of parameters by path; these parameters are fitted.
-        fixed: values of parameters that are not fitted, by path [SI].
-        start: start values of the search, by path [SI].
+        priors: priors of parameters, keyed by path; these parameters are fitted.
+        fixed: values of parameters that are not fitted, keyed by path [SI].
+        start: start values of the search, keyed by path [SI].
         free: paths of parameters that are fitted with their declared priors although they are not
             fitted by default.
         image_centre: point x, y in the frame of the poses at which the camera's tilt and distortion

@@ -46,7 +46,7 @@ class DriveResult:
 
     def __str__(self) -> str:
         m = self.metrics
-        ended = "ends" if m.finished else "was given up; with the remaining path, it ends"
+        ended = "ends" if m.finished else "was given up; plus the path that remained, it ends"
         return (
             f"{ended} {m.closure_mm:.0f} mm from the end of the path, with a heading error of "
             f"{m.heading_error_deg:+.1f} deg; cross-track error {m.cross_track_rmse_mm:.0f} mm "

@@ -86,13 +86,13 @@ def simulate_runs(
     voltage: bool = True,
     seed: int = 0,
 ) -> SimulatedRuns:
-    """Return simulated runs of a robot with known parameters, and sensor noise as on a Robotino.
+    """Return simulated runs of a robot whose parameters are known, with a Robotino's sensor noise.
 
     An older name, `made_runs`, still works.
 
     Args:
-        floors: names of the floors; `firm` and `soft` have particular parameters, other floors the
-            declared start values.
+        floors: names of the floors; `firm` and `soft` have particular parameters, and any other
+            floor has the declared start values.
         headings: number of evenly spread directions of travel, on every floor at every speed.
         speeds: speeds of the runs [m/s].
         turns: number of additional curved runs, on every floor at every speed.

@@ -86,12 +86,13 @@ def calibrate(
     --lens-height describe a camera that looks straight down; the origin is then in the middle of
     the picture, with x to the right and y up.
 
-    For a lens at height H, a point at height h above the floor appears too far from the point below
-    the lens, by the factor H / (H - h). With H = 2.4 m and h = 0.25 m, lengths would be 11.6 % too
-    long. Therefore calibrate on the floor, and give the height of the robot's marker to `slipid
+    For a lens at height H, a point at height h above the floor appears H / (H - h) times as far
+    from the point below the lens as it is. With H = 2.4 m and h = 0.25 m, lengths would be 11.6 %
+    too long. Therefore calibrate on the floor, and give the height of the robot's marker to `slipid
     track`.
 
-    The exit code is 1 if the calibration is poor but usable: the file is written, with the reasons.
+    The exit code is 1 if the calibration is poor but usable; the file, which is written all the
+    same, then contains the reasons.
     """
     from slipid.camera.calibration.calibrate import (
         floor_from_board,

@@ -79,8 +79,8 @@ def executor_of(jobs: int | None) -> "Executor":
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     """Return a command that turns exceptions into exit codes.
 
-    For bad input (`DataError`) it prints the message and exits with code 2, after an interrupt with
-    code 130.
+    For bad input (`DataError`) it prints the message and exits with code 2; after an interrupt it
+    exits with code 130.
     """
 
     @functools.wraps(command)

@@ -28,7 +28,7 @@ def floors(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Find the floor under each wheel in logged runs, and the distance to the next floor.
+    """Find the floor under each wheel in logged runs, and its distance to the nearest border.
 
     The poses are corrected with the camera parameters of the fit. A CSV file is written for each
     run. The exit code is 1 if wheels are often outside the map.

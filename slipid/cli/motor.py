@@ -19,10 +19,10 @@ def motor(
     time: Annotated[Column, _column("Column with the time, in s.")] = None,
     voltage: Annotated[Column, _column("Column with the voltage across the motor, in V.")] = None,
     current: Annotated[
-        Column, _column("Column with the current, in A; with another unit, such as I:mA.")
+        Column, _column("Column with the current, in A, or in a unit that you add, as in I:mA.")
     ] = None,
     speed: Annotated[
-        Column, _column("Column with the shaft speed, in rad/s; with another unit, such as w:rpm.")
+        Column, _column("Column with the shaft speed, in rad/s, or in an added unit, as in w:rpm.")
     ] = None,
     angle: Annotated[
         Column, _column("Column with the shaft angle, in rad, instead of the speed.")

@@ -61,7 +61,7 @@ def new(
         Text, _text("General: drive directions of the wheels, such as 0,0.", _WHEELS)
     ] = None,
     rollers_deg: Annotated[
-        Text, _text("General: angles of the rollers to these directions, such as 45,none.", _WHEELS)
+        Text, _text("General: angles of the rollers to the drives, such as 45,none.", _WHEELS)
     ] = None,
     yes: Annotated[
         bool, flag("--yes", "Do not ask: use defaults, which are marked in the config.")
@@ -69,7 +69,7 @@ def new(
     force: Annotated[bool, flag("--force", "Overwrite an existing file.")] = False,
 ) -> int:
     """Write a commented config for your robot, from your answers to questions or from its logs."""
-    # collect the arguments that are texts: these, and no others, describe the robot
+    # collect the arguments that are strings: exactly these describe the robot
     options = {name: text for name, text in locals().items() if isinstance(text, str)}
 
     from slipid.app.new.config_text import new_config

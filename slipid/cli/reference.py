@@ -14,7 +14,8 @@ def reference(
         str | None,
         typer.Argument(
             metavar="[WHAT]",
-            help="config, drives, layouts, channels, units, presets or parameters; all by default.",
+            help="Part to print: config, drives, layouts, channels, units, presets or parameters; "
+            "all by default.",
         ),
     ] = None,
     config: Annotated[

@@ -21,7 +21,7 @@ def selftest(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Simulate the experiment with known true values, fit it, and compare the result with them.
+    r"""Simulate an experiment with known true values, and compare its fit with these values.
 
     Without --data, the runs are those planned in \[selftest] of the config. Writes selftest.json.
     After an interrupt, finished simulations are kept. The exit code is 1 if a parameter that should

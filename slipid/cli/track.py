@@ -40,7 +40,7 @@ def track(
     dictionary: Annotated[str, option("NAME", "Name of the dictionary of the marker.")] = "4X4_50",
     id: Annotated[
         int | None,
-        typer.Option(min=0, help="Number of the marker; by default the only one that is seen."),
+        typer.Option(min=0, help="Id of the marker; by default that of the only visible marker."),
     ] = None,
     targets: Annotated[
         Path | None,

@@ -31,7 +31,7 @@ def trial(
     ] = None,
     told_map: Annotated[
         Path | None,
-        option("FILE", "Map for the controllers that use one; by default the true map."),
+        option("FILE", "Map given to the controllers that use one; by default the true map."),
     ] = None,
     controllers: Annotated[
         str | None, option("NAMES", "Controllers separated by commas; all by default.")

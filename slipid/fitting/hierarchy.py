@@ -69,7 +69,7 @@ class AxisEffects(NamedTuple):
 
 
 def effect_variances(axes: Iterable[AxisEffects], log_v: Variances) -> Variances:
-    """Return all log variances, those of run, shared and session effects after scoring steps."""
+    """Return all log variances; scoring steps update those of run, shared and session effects."""
     out = np.array(log_v)
     for axis in axes:
         out[axis.numbers] = _scoring_steps(axis, out[axis.numbers])
@@ -99,7 +99,7 @@ def extrapolation(
     distance: Float[np.ndarray, " segment"],
     setup: Sequence[str],
 ) -> dict[str, float]:
-    """Return the factor that enlarges the variances in directions without runs, keyed by set-up.
+    """Return the factor, keyed by set-up, that enlarges variances in directions without runs.
 
     The runs of each sector of directions are predicted from the other sectors, with the parameters
     of the floor estimated without that sector (to first order). The variances of shared effects and
@@ -107,9 +107,9 @@ def extrapolation(
     regions; the variances of individual run effects and of the noise, which other runs do not
     predict, are kept. The factor is 1 if at least 90 % of the end points already lie in their
     regions, or if there are fewer than three sectors or fewer than `LEAST_RUNS` runs. The factor is
-    needed for two reasons: maximum likelihood fits the variances to distances between neighbouring
-    runs, so that the variances are too small if the model is wrong on a larger scale; and the fit
-    down-weights outliers, which occur in forecast runs as well.
+    needed for two reasons: maximum likelihood fits the variances to differences between runs in
+    neighbouring directions, so that the variances are too small if the model is wrong over a wider
+    range of directions; and the fit down-weights outliers, which occur in forecast runs as well.
 
     Args:
         axes: results of `axis_effects`.
@@ -311,7 +311,7 @@ def _scoring_steps(axis: AxisEffects, log_v: np.ndarray) -> np.ndarray:
 
 
 def pooled(precision: Square, z: Search, objective: Objective, log_v: Variances) -> float:
-    """Return the log of the posterior mean variance of the load biases of floors.
+    """Return the log of the posterior mean variance of the floors' load biases.
 
     Arguments are those of `pooled_stds`.
     """
@@ -320,7 +320,7 @@ def pooled(precision: Square, z: Search, objective: Objective, log_v: Variances)
 
 
 class PooledStds(NamedTuple):
-    """Posterior of the std of the load biases of floors, on a grid.
+    """Posterior of the std of the floors' load biases, on a grid.
 
     Attributes:
         std: candidate stds.
@@ -358,7 +358,7 @@ def pooled_stds(precision: Square, z: Search, objective: Objective, log_v: Varia
             - np.log(np.diag(root)).sum()
             - len(at) * np.log(part * typical)
             - 0.5 * part**2
-            # The grid is geometric: a candidate stands for an interval in proportion to its std.
+            # The grid is geometric: the interval around a candidate is proportional to its std.
             + np.log(part)
         )
     weight = np.exp(np.array(log) - max(log))

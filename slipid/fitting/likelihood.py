@@ -134,8 +134,9 @@ def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
 def predict(robot: Robot, b: Batch, near: NearTwists | None = None) -> Predicted:
     """Return the motion and motor forces of every window at its contact equilibrium.
 
-    `near` holds twists close to the equilibria, which are then found about ten times sooner. Where
-    the root finder does not converge from there, as from NaN, all are found without `near`.
+    `near` holds twists close to the equilibria, so that the root finder is about ten times faster.
+    If it does not converge in some window, for example where `near` is NaN, the equilibria of all
+    windows are found without `near`.
     """
     frame, w = robot.geometry.frame(), wheel_speed(robot, b)
     still = jax.lax.stop_gradient((robot, frame, w, b, near))
@@ -234,7 +235,7 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
 
 @eqx.filter_jit
 def corrected(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
-    """Return logged poses in corrected metres."""
+    """Return logged poses as corrected by the robot's camera model (x, y [m], heading [rad])."""
     return jax.vmap(jax.vmap(robot.camera.corrected))(pose)
 
 
@@ -334,6 +335,6 @@ def voltage_spread(b: Batch, noise: ElectricNoise) -> PerChannel:
 def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
     """Return the std of the voltage noise [V], rounding included, from the log of its variance.
 
-    The rounding `ROUNDING_VARIANCE` keeps it above zero, since `voltage_spread` divides by it.
+    `voltage_spread` divides by this std, which the rounding (`ROUNDING_VARIANCE`) keeps above zero.
     """
     return jnp.sqrt(jnp.exp(log_variance) + ROUNDING_VARIANCE["voltage"])

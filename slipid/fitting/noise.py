@@ -132,7 +132,7 @@ POOLED = "pooled.load_bias"
 def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = None) -> NoiseModel:
     """Return the noise model of windows; distances and directions come from the encoders.
 
-    The segments of `multi_floor`, if given, are counted after those of `windows`.
+    The segments of `multi_floor`, if given, are indexed after those of `windows`.
     """
     floors = robot.surfaces.labels
     table = [
@@ -176,7 +176,7 @@ def electric_noise(
     log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"],
     resistance: Array,
 ) -> ElectricNoise:
-    """Return the noise that predicted voltages depend on; a placeholder if none are logged."""
+    """Return the noise that predicted voltages depend on; a placeholder without logged voltages."""
     if "voltage" not in blocks:
         return ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
     current, log_v = blocks["current"], jnp.asarray(log_variance)
@@ -251,7 +251,7 @@ def _components(
 def encoder_increments(
     windows: Windows | Batch, robot: Robot
 ) -> Float[np.ndarray, "segment window 3"]:
-    """Return the body-frame pose increment of each window without slip, by encoders [m, m, rad]."""
+    """Return each window's body-frame increment if no wheel slipped, by encoders [m, m, rad]."""
     j = np.asarray(robot.geometry.pseudo_inverse())
     return np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
 
@@ -297,9 +297,10 @@ def _motion_components(
 
 
 def axes(u: np.ndarray) -> np.ndarray:
-    """Return unit residuals along, across and in yaw per window (axis, segment, 3 window, window).
+    """Return the residuals that unit motion along, across or in yaw causes in each window.
 
-    `u` is the unit direction of travel in each window, as `travel` returns it.
+    The shape is (axis, segment, 3 window, window); the last index is that of the moving window. `u`
+    is the unit direction of travel in each window, as `travel` returns it.
     """
     n, k, _ = u.shape
     out = np.zeros((3, n, 3 * k, k))

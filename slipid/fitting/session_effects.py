@@ -1,4 +1,4 @@
-"""Effects that the runs of one session share beyond the model, and the covariance with them.
+"""Effects that the runs of one session share beyond the model, and the covariance they enlarge.
 
 Runs driven on one floor in one session all slip a little more, or all a little less, than the model
 predicts. The slip models of the comparison are fitted as if runs were independent. After such a
@@ -61,8 +61,9 @@ class LinearModel:
 def with_session_effects(
     model: LinearModel, w: Windows, keep: Float[np.ndarray, " segment"]
 ) -> tuple[dict[str, float], Float[np.ndarray, "number number"]]:
-    """Return variances keyed `session.<floor>.<axis>`, and the parameter covariance with them.
+    """Return variances keyed `session.<floor>.<axis>`, and the covariance that includes them.
 
+    The covariance is that of the fitted parameters, enlarged as in the module docstring.
     A floor driven in only one session has no such variances: the common effect of its runs is then
     part of the floor's fitted parameters.
     """

@@ -46,7 +46,7 @@ SPEED_LENGTH = 0.5
 OTHER_LOAD_CORRELATION = 0.5
 """Correlation of effects with different load set-ups."""
 MIRROR_CORRELATION = 0.7
-"""Correlation of effects in mirrored directions, h."""
+"""Correlation h of effects in mirrored directions."""
 _HARMONICS = 15
 """Number of harmonics of the kernel over directions; higher ones hold 1 % of its variance."""
 _SPEED_STEP = 0.25
@@ -153,7 +153,7 @@ class SharedEffects(eqx.Module):
     Attributes:
         segments: indices of the floor's segments.
         effect: change of these segments' residuals per unit of an effect along, across and in yaw.
-        near: root of the kernel over driving conditions, by axis and segment.
+        near: root of the kernel over driving conditions (`TravelConditions.basis`).
         session: 1 in the column of each segment's session, else 0.
         numbers: indices of the variances; rows are run, neighbours' and session effects, columns
             the axes; -1 if there is no such variance.
@@ -169,7 +169,7 @@ class SharedEffects(eqx.Module):
     def root(
         self, log_v: Float[Array, " variance"] | Float[np.ndarray, " variance"]
     ) -> Float[Array, "3 run coef"]:
-        """Return S: effects along, across and in yaw per unit coefficient, e = S u."""
+        """Return the matrix S of e = S u: effects along, across and in yaw per unit coefficient."""
         std = jnp.where(self.numbers < 0, 0.0, jnp.exp(0.5 * log_v)[self.numbers])
         parts = [std[k, :, None, None] * x for k, x in ((1, self.near), (2, self.session[None]))]
         return jnp.concatenate(parts, axis=-1)
@@ -212,9 +212,9 @@ class EffectPosterior(eqx.Module):
 
     Attributes:
         segments: indices of the floor's segments.
-        span: W E, change of the whitened residuals per unit of an effect.
-        root: S, effects per unit coefficient.
-        factor: lower Cholesky factor of C, the precision of the coefficients.
+        span: matrix W E, the change of the whitened residuals per unit of an effect.
+        root: matrix S, the effects per unit coefficient.
+        factor: lower Cholesky factor of the coefficients' precision C.
     """
 
     segments: Int[Array, " run"]
@@ -294,9 +294,9 @@ def effect_covariances(posteriors: Posteriors, count: int) -> Float[Array, "segm
 
 
 marginal_slopes = jax.vmap(marginal_residuals, in_axes=(None, -1), out_axes=-1)
-"""Function that returns `marginal_residuals` of every column (segment, m, free)."""
+"""Function that applies `marginal_residuals` to each column of a Jacobian (segment, m, free)."""
 mean_effect_slopes = jax.vmap(mean_effects, in_axes=(None, -1), out_axes=-1)
-"""Function that returns `mean_effects` of every column (segment, m, free)."""
+"""Function that applies `mean_effects` to each column of a Jacobian (segment, m, free)."""
 
 
 class EffectForecast(NamedTuple):

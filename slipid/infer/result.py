@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 Evidence = TypeVar("Evidence")
 
 CONFLICT_STDS = 4.0
-"""A message warns if a parameter is further than this from its prior mean [prior std]."""
+"""Distance of a parameter from its prior mean above which a message warns [prior std]."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ class Fit:
         lag: camera lag for which the windows were cut [s].
         seed: seed of the draws from which the bands of the curves are computed.
         baselines: fitted parameters of simpler slip models, for comparison.
-        mixed: for runs over several floors: their prediction errors in a fit without them and in
-            fits to half of them, and the end-point errors, keyed by floor, of the runs on one floor
-            before and after the runs over several floors were added.
+        mixed: test of the runs over several floors: their prediction errors in a fit to all other
+            runs, and in fits that include half of them; and the end-point errors of the runs on one
+            floor, keyed by floor, before and after the runs over several floors were added.
         refused: the content of `mixed`, with a reason, if the runs over several floors contradict
             the runs on one floor and were therefore not fitted.
         data: runs on one floor each; None for a fit that was loaded from its files.
@@ -170,8 +170,8 @@ class Fit:
         """Return the profile likelihood of one free parameter, all others refitted at each point.
 
         Raises:
-            ValueError: the parameter does not exist, is fixed or a vector; the message lists valid
-                ones.
+            ValueError: the parameter does not exist, is fixed, or is a vector; the message lists
+                the parameters that have a profile.
         """
         with Reporter(quiet=quiet) as report:
             report.stage(f"profile of {path}")
@@ -180,7 +180,7 @@ class Fit:
     def validate(self, runs: Runs) -> Validation:
         """Return the scores of runs predicted open loop by the fit and by simpler slip models.
 
-        The simpler models are those that were fitted to the same runs.
+        The simpler models were fitted to the same runs as the fit itself.
 
         Raises:
             DataError: a run has a floor or a load set-up that was not identified.
@@ -232,10 +232,10 @@ class Fit:
         return compared(problem, self.choices, data, question, parts, quiet)
 
     def design(self, *parameters: str, runs: int = 12) -> "Design":
-        """Return the runs to drive next, which reduce the intervals of given parameters most.
+        """Return the runs to drive next to reduce the intervals of given parameters most.
 
-        Without names, the runs are chosen for predictions and for all parameters with the verdict
-        weak.
+        If no parameter is given, the runs are chosen for predictions and for all parameters with
+        the verdict `weak`.
 
         Raises:
             DataError: a parameter does not exist or is fixed.
@@ -304,7 +304,7 @@ class Fit:
 
     @cached_property
     def disputes(self) -> dict[tuple[str, str], float]:
-        """Pairs of floors whose estimated wheel loads disagree, and by how many standard errors."""
+        """Difference of wheel loads [standard error], keyed by each pair of disagreeing floors."""
         return disputes(self.verdict_space, self.z, self.covariance)
 
     @cached_property
@@ -320,7 +320,7 @@ class Fit:
 
     @cached_property
     def derived(self) -> dict[str, Estimate]:
-        """Ratios of parameters, keyed by path; a ratio may be identified if its parts are not."""
+        """Ratios of parameters, keyed by path; one may be identified even if its parts are not."""
         found = derived(self.space, self.z, self.covariance, self.channels.voltage)
         return {e.path: e for e in found}
 
@@ -330,7 +330,8 @@ class Fit:
         found = [*sentences(self.flat)]
         found += [
             f"the wheel loads estimated on {one} and on {other} differ by {sigma:.1f} standard "
-            "errors of their noise: the contact law is incomplete; the intervals include this"
+            "errors of their noise: the contact law is incomplete; the intervals include this "
+            "difference"
             for (one, other), sigma in self.disputes.items()
         ]
         found += [

@@ -22,7 +22,7 @@ CURVE_POINTS = 41
 _STEADY = 0.1
 """Largest deviation of a steady command from the run's median command, relative to the median."""
 _MOVED = 0.1
-"""A window counts as moving above this fraction of the speed of the fastest window."""
+"""Fraction of the fastest window's speed above which a window counts as moving."""
 _SECTOR, _COMMON = 30.0, 0.02
 """Width of a sector of headings [deg], and smallest fraction of all windows that a sector must
 contain for its heading to count as driven."""
@@ -131,7 +131,7 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """Return the ranges of speed, torque, slip and motion that the runs on each floor cover."""
     speed, torque, slip = wheel_states(robot, b)
     back = np.asarray(robot.geometry.pseudo_inverse()) * float(robot.geometry.wheel_radius)
-    # The ranges refer to the motion computed from the encoders without slip.
+    # The ranges refer to the motion by the encoders, as if no wheel slipped.
     twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T
     yaw = twist[..., 2]
     floor, length = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
@@ -184,7 +184,7 @@ def by_encoders(
     angle = np.degrees(np.arctan2(twist[ahead, 1], twist[ahead, 0]))
     headings, count = np.unique((np.round(angle / _SECTOR) * _SECTOR) % 360.0, return_counts=True)
     common = headings[count >= _COMMON * count.sum()]
-    # The headings of commands are in (-180, 180] deg.
+    # Headings by encoders get the range of commanded ones, (-180, 180] deg.
     signed = np.where(common > 180.0, common - 360.0, common)
     parts = (0.1, 0.5, 0.9)
     speeds = np.quantile(speed[ahead], parts) if ahead.any() else np.zeros(0)
@@ -198,10 +198,10 @@ def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:
 
 
 def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
-    """Return a [A] and b [A s/m] of the line a + b v fitted to current residuals, v the speed.
+    """Return a [A] and b [A s/m] of the line a + b v fitted to current residuals.
 
-    A residual is measured less predicted current, times the sign of the predicted current; all
-    floors are fitted together.
+    v is the speed of the body. A residual is measured less predicted current, times the sign of the
+    predicted current; all floors are fitted together.
     """
     predicted = lk.predicted_current(robot, b, lk.predict(robot, b).motor_force)
     residual = np.asarray((b.current - predicted) * jnp.sign(predicted))

@@ -42,9 +42,10 @@ class Camera(eqx.Module):
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 
     def corrected(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return a logged pose in true metres, its heading rotated as the map rotates directions.
+        """Return a logged pose, corrected for the scale and the distortion of the camera.
 
-        The heading is still that of the marker: the marker yaw is not subtracted.
+        The position is in true metres. The heading is rotated as the map of positions rotates a
+        direction there, and is still that of the marker: the marker yaw is not subtracted.
         """
         u = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
         place, turned = jax.jvp(self._ground, (pose[:2],), (u,))

@@ -33,8 +33,8 @@ SETTLE_CHORD_STEPS, SETTLE_NEWTON_STEPS = 4, 2
 """Numbers of chord and of Newton steps that `settle` takes from the previous time step's twist.
 
 With wheel speeds that change by up to 1.25 rad/s per time step and three floors, 99 % of all twists
-are then within 3 mm/s of the equilibrium (20 mm/s with 2 and 3 steps), and half of them within
-rounding errors.
+are then within 3 mm/s of the equilibrium (20 mm/s with 2 chord and 3 Newton steps), and half of
+them within rounding errors.
 """
 
 
@@ -44,8 +44,8 @@ class ContactProblem(eqx.Module):
     Attributes:
         rim: r w, rim speed of each wheel [m/s].
         frame: wheel directions.
-        surface: one floor, or one under each wheel.
-        rest: load shares at rest, sum 1.
+        surface: floor under all wheels, or floor under each wheel (see `ContactSurface.at`).
+        rest: load shares at rest, whose sum is 1.
     """
 
     rim: Float[Array, " wheel"]
@@ -73,7 +73,8 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
     damping = jnp.asarray(_DAMPING)
     tried = jax.vmap(merit)(damping)
     best = jnp.argmin(tried)
-    # where all wheels slide, forces depend little on the twist and Newton's step leads far away
+    # where all wheels slide, forces depend little on the twist and Newton's step leads far away, so
+    # a chord step replaces it
     stuck = (tried[best] >= before) & (before > _ROUNDING)
     return jax.tree.map(partial(jnp.where, stuck), here.chord(), less(damping[best]))
 
@@ -82,7 +83,8 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
 def root(problem: ContactProblem) -> Float[Array, "3"]:
     """Return the twist at which the forces balance, found from the twist without slip.
 
-    Its derivative is that of `differentiable`, not that of this function.
+    Derivatives of the twist are those of `differentiable`; the derivative of this function itself
+    is that of its iterations.
     """
     balance = problem.balance()
 
@@ -99,10 +101,11 @@ def root(problem: ContactProblem) -> Float[Array, "3"]:
 
 @jax.jit
 def root_near(problem: ContactProblem, start: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return the root found by plain Newton steps from a twist close to it, about ten times sooner.
+    """Return the root of the force balance, found by plain Newton steps from a twist close to it.
 
-    The result is NaN if they do not converge. The last step is below 1e-6 m/s or rad/s, so that the
-    remaining error is of the order of its square.
+    This takes about a tenth of the time of `root`. The result is NaN if the steps do not converge.
+    The last step is below 1e-6 m/s or rad/s, so that the remaining error is of the order of the
+    square of this step.
     """
     balance = problem.balance()
 
@@ -122,7 +125,7 @@ def root_near(problem: ContactProblem, start: Float[Array, "3"]) -> Float[Array,
 
 @jax.custom_jvp
 def differentiable(problem: ContactProblem, xi: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return the root `xi` of a problem, with the derivative that it has as a function of it.
+    """Return the root `xi` of a problem, with its derivative with respect to the problem.
 
     The derivative follows from the implicit function theorem, however the root was found.
     """
@@ -171,21 +174,22 @@ def equilibrium(
 def settle(
     start: Float[Array, "3 floors"], rim: Array, on: Stance, plain: Float[Array, "3 wheel"]
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
-    """Return the equilibria on many floors at once, and the tractions, from recent twists.
+    """Return the equilibria on many combinations of floors, found from earlier twists.
 
-    A few chord steps are followed by Newton steps, which are kept if they reduce the residual
+    A few chord steps are followed by Newton steps, whose result is used if it reduces the residual
     force; the small fixed number of steps suits the computer of a robot. If the result is not
     finite, the twist without slip is returned. The error that remains after a jump of the wheel
     speeds is removed in the following calls.
 
     Args:
-        start: twists [m/s, m/s, rad/s].
+        start: twists of the previous time step, a column for each combination of floors [m/s, m/s,
+            rad/s].
         rim: rim speeds, the same on all floors (wheel,) or by column (wheel, floors) [m/s].
         on: stance of the robot on each combination of floors, arrays (wheel, floors).
-        plain: J^+, body twist without slip per rim speed.
+        plain: matrix J^+ from rim speeds to the body twist without slip.
 
     Returns:
-        Twists, and tractions [m g mean(mu)].
+        Twists, and tractions of the wheels [m g mean(mu)].
     """
     rim = rim.reshape(plain.shape[1], -1)
     balance = Balance(rim, on)
@@ -193,14 +197,15 @@ def settle(
     def chord(xi: Planar, _: None) -> tuple[Planar, None]:
         return balance.at(xi).chord(), None
 
-    # unrolled for XLA; a loop in the generated C code
+    # `unroll` spares XLA the overhead of a loop; the generated C code has a loop all the same
     near, _ = jax.lax.scan(
         chord, Planar(*start), length=SETTLE_CHORD_STEPS, unroll=SETTLE_CHORD_STEPS
     )
     xi = near
     for _ in range(SETTLE_NEWTON_STEPS):
         xi = jax.tree.map(jnp.subtract, xi, balance.at(xi).newton)
-    # a comparison with NaN is false, so that NaN is never nearer
+    # use the result of Newton's steps only if it is nearer to the equilibrium; a comparison with
+    # NaN is false, so that NaN is never used
     last, first = balance.at(xi), balance.at(near)
     nearer = balance.size(last.force) <= balance.size(first.force)
     found = jax.tree.map(lambda x, n: jnp.where(nearer, x, n), xi, near)

@@ -26,8 +26,9 @@ class Stance(eqx.Module):
     """A robot on its floors: geometry, loads and floor parameters of every wheel.
 
     Attributes:
-        frame, rest: wheel directions and apparent load shares at rest, with an axis for the batch.
-        hold, roll, shift: matrices of `frame`, split by component of the twist, each (wheel, *one).
+        frame, rest: wheel directions and apparent load shares at rest, with axes for the batch.
+        hold, roll, shift: matrices of `frame`, split by component of the twist, each (wheel, *one);
+            `*one` are batch axes of length 1.
         floor: floor parameters under each wheel or under all; friction is relative to its mean,
             scrub and lead are means over the loads, and the roller parameters are those of
             `law.sideways`.
@@ -50,7 +51,7 @@ class Stance(eqx.Module):
 def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
     """Return a robot's stance on one floor, or on one floor per wheel.
 
-    The leaves of `surface` are single numbers for one floor, else arrays (wheel, *batch).
+    The leaves of `surface` are single numbers for one floor, otherwise arrays (wheel, *batch).
     """
     floor, friction = replace(surface, friction=jnp.ones(())), surface.friction
     if jnp.ndim(friction) > 0:
@@ -80,7 +81,7 @@ def total(of_wheels: Float[Array, "wheel *batch"]) -> Float[Array, "*batch"]:
 
 
 class Balance(eqx.Module):
-    """The forces on a body by its twist, in units of mean(mu) m g.
+    """The forces on a body as functions of its twist, in units of mean(mu) m g.
 
     Attributes:
         rim: r w, rim speeds [m/s].
@@ -105,7 +106,7 @@ class Balance(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class BalanceAt:
-    """Forces of a `Balance` at one twist; what several of them need is traced once.
+    """Forces of a `Balance` at one twist; values that several forces need are traced once.
 
     Attributes:
         rim, on: as in `Balance`.
@@ -118,7 +119,10 @@ class BalanceAt:
 
     @cached_property
     def speeds(self) -> tuple[Array, Array]:
-        """Speeds of the wheels along their drive and along their rollers [m/s]."""
+        """Speed of each wheel centre along its drive, and its roller speed [m/s].
+
+        They are J xi and q of `slipid.model.contact_law`.
+        """
         on = self.on
         return dot(on.hold, self.xi), dot(on.roll, self.xi) - self.rim * on.frame.roller_share
 
@@ -148,13 +152,18 @@ class BalanceAt:
         return Planar(x, y, yaw - law.scrub_moment(self.xi.yaw, self.on.floor.scrub).force)
 
     def jacobian(self) -> Columns:
-        """Return the derivative of the force by the twist, through speeds and through loads."""
+        """Return the derivative of the force with respect to the twist.
+
+        It includes the changes of the wheels' speeds and of their load shares with the twist.
+        """
         w, load, on = self.wheels, self.load, self.on
-        by_roll = self.speeds[1] / w.active  # derivative of the activity by the roller speed
+        # derivative of the activity with respect to the roller speed
+        by_roll = self.speeds[1] / w.active
         by_along = -w.traction.by_speed() - w.resistance.by_speed()
         across = (w.traction.by_activity() - w.resistance.by_activity()) * by_roll
         rolls = -w.drag.by_speed() - w.drag.by_activity() * by_roll
-        turned: Array | float = 0.0  # derivative of the drag along rollers by the speed along drive
+        # derivative of the drag along the rollers with respect to the speed along the drive
+        turned: Array | float = 0.0
         if on.frame.ordinary:
             across = across + on.frame.grip * w.traction.by_beside()
             turned = load * on.frame.grip * w.drag.by_beside()
@@ -212,7 +221,7 @@ class BalanceAt:
 
     @property
     def rolling_drag(self) -> Float[Array, "wheel *batch"]:
-        """Rolling drag of each wheel along its drive, for `Motor.rolling_drag` 1.
+        """Rolling drag of each wheel in its drive direction if `Motor.rolling_drag` is 1.
 
         Only the motors work against it; it exerts no force on the body.
         """

@@ -5,7 +5,7 @@ speed of wheel i along its drive and along its rollers' free direction, p_i its 
 load share, v^ the direction of motion, and forces in units of mu m g:
 
     N0_i  = (share of the weight) exp(delta_i), scaled to sum 1
-    g_i   = (w N0_i)^(p - 1)                           drag grows with the load; w wheels
+    g_i   = (w N0_i)^(p - 1)                           drag grows with the load; w: number of wheels
     q_i   = K_i xi                                     roller speed
     c_i   = sqrt((r w_i)^2 + q_i^2)                    wheel activity
     vs_i  = r w_i - J_i xi                             sliding speed
@@ -22,7 +22,7 @@ their total sliding: with m_i = sqrt(vs_i^2 + q_i^2) the first terms of T_i and 
 
     N_i tanh(m_i / (v0 + s0 c_i)) vs_i / m_i,     -N_i tanh(m_i / (v0 + s0 c_i)) q_i / m_i
 
-Wheels may stand on different floors. Forces are then in units of mean(mu) m g, each wheel's
+Wheels may stand on different floors. Forces are then in units of mean(mu) m g, those of wheel i are
 weighted by mu_i / mean(mu), and b and cz are means over the loads. Creep and rolling resistance are
 rate-independent (s0 is a slip *ratio*): with a resistance that sets in at a fixed speed of 20 mm/s
 instead, runs faster than the fitted ones are predicted worse.
@@ -109,7 +109,7 @@ class ContactSurface(eqx.Module):
         """Return the surface at `index` of the stack, or the surface under each wheel.
 
         `index` may be traced. With an index per wheel, wheels are the first axis, and each wheel
-        has the load bias that the floor under it declares for this wheel.
+        has the load bias that belongs to it and to the floor under it.
         """
         bias = self.load_bias[index]
         if jnp.ndim(index):
@@ -123,7 +123,7 @@ class ContactSurface(eqx.Module):
 
 
 class Friction(eqx.Module):
-    """A force against a speed that saturates: top tanh(m / onset) speed / m + viscosity speed.
+    """A saturating force against a speed: top tanh(m / onset) speed / m + viscosity speed.
 
     m is the magnitude of the speed, or of the total sliding of which this speed is one component:
     friction acts against the total sliding.
@@ -132,7 +132,7 @@ class Friction(eqx.Module):
         speed: sliding or rolling speed [m/s].
         onset: speed at which the force reaches tanh(1) = 76 % of `top` [m/s]; it is linear in the
             wheel's activity.
-        ratio: derivative of the onset by the activity.
+        ratio: derivative of the onset with respect to the activity.
         top: saturated force.
         viscosity: force per speed.
         beside: component of the sliding at right angles to `speed` [m/s]; None where friction in
@@ -154,26 +154,26 @@ class Friction(eqx.Module):
         return (self.top * self._slope() + self.viscosity) * self.speed
 
     def chord(self) -> Array:
-        """Return force over speed, which is even in the speed and finite at rest."""
+        """Return force over speed, an even function of the speed that is finite at rest."""
         if self.beside is None:
             size = jnp.abs(self.speed) + 1e-12 * self.onset
             return self.top * (jnp.tanh(size / self.onset) / size) + self.viscosity
         return self.top * self._slope() + self.viscosity
 
     def by_speed(self) -> Array:
-        """Return the derivative with respect to the speed at a constant activity."""
+        """Return the derivative of the force with respect to the speed at a constant activity."""
         if self.beside is None:
             return self._top_slope() / self.onset + self.viscosity
         return self.top * (self._slope() + self._slope_change() * self.speed**2) + self.viscosity
 
     def by_beside(self) -> Array | float:
-        """Return the derivative of the force by the sliding at right angles, `beside`."""
+        """Return the derivative of the force with respect to `beside`."""
         if self.beside is None:
             return 0.0
         return self.top * self._slope_change() * self.speed * self.beside
 
     def by_activity(self) -> Array:
-        """Return the derivative with respect to the wheel's activity at a constant speed."""
+        """Return the derivative of the force with respect to the activity at a constant speed."""
         return -(self._top_slope() / self.onset) * (self.speed / self.onset) * self.ratio
 
     def _top_slope(self) -> Array:
@@ -191,7 +191,7 @@ class Friction(eqx.Module):
         return jnp.tanh(self._size() / self.onset) / self._size()
 
     def _slope_change(self) -> Array:
-        """Return the derivative of `_slope` by m, divided by m."""
+        """Return the derivative of `_slope` with respect to m, divided by m."""
         m = self._size()
         steep = (1 - jnp.tanh(m / self.onset) ** 2) / self.onset
         return (steep - self._slope()) / m**2
@@ -239,9 +239,9 @@ def wheel_traction(
 
 
 def rolling_fraction(rim: Array, roll: Array, drive_share: Array) -> Array:
-    """Return (r w / c) |r w / c|, to which rolling drag along the drive is in proportion.
+    """Return (r w / c) |r w / c|, to which the rolling drag in the drive direction is proportional.
 
-    It is the signed square of the rim speed over the wheel activity c.
+    It is the signed square of the ratio of the rim speed r w to the wheel activity c.
     """
     along = rim * drive_share * jax.lax.rsqrt(rim**2 + roll**2 + 1e-12)
     return along * jnp.abs(along)
@@ -263,16 +263,20 @@ def at_load(floor: ContactSurface, relative: Array) -> ContactSurface:
 
 
 def apparent_load(rest: Float[Array, "wheel *one"], bias: Array) -> Float[Array, "wheel *batch"]:
-    """Return load shares at rest with a floor's load biases (wheel, *batch), or 0 for none."""
+    """Return the apparent load shares at rest: N0 of the module docstring.
+
+    `bias` holds the load biases of the floor (wheel, *batch), or is 0 if there are none.
+    """
     seen = rest * jnp.exp(bias)
     return seen / sum(seen[1:], start=seen[0])
 
 
 def sideways(floor: ContactSurface, grip: Array) -> tuple[ContactSurface, Array]:
-    """Return the floor with the sideways friction of each wheel, and its drag onset [m/s].
+    """Return the floor with the sideways friction of each wheel, and the drag's onset at rest.
 
-    `grip` is 1 for a wheel without rollers, whose friction sideways is the same as ahead, and 0 for
-    a wheel with rollers.
+    The onset is the sideways speed [m/s] below which the drag of a wheel at rest is viscous. `grip`
+    is 1 for a wheel without rollers, whose friction sideways is the same as ahead, and 0 for a
+    wheel with rollers.
     """
     free = 1 - grip
     out = replace(
@@ -298,7 +302,7 @@ def wheel_forces(
     Args:
         along, roll, rim: J xi, q and r w of the module docstring.
         drive_share: `WheelFrame.drive_share`.
-        at_rest, floor: results of `sideways`.
+        at_rest, floor: onset of the drag at rest, and floor, both from `sideways`.
         grip: `WheelFrame.grip` of a robot that has wheels without rollers, whose friction acts
             against the total sliding; None for a robot with rollers on all wheels.
     """
@@ -328,7 +332,7 @@ def load_shift(xi: Planar, rest: Array, shift: Float[Array, "2 wheel *one"], lea
 def load_shift_slope(
     xi: Planar, shift: Float[Array, "2 wheel *one"], lead: Array
 ) -> tuple[Array, Array]:
-    """Return the derivatives of `load_shift` by the two velocities [s/m]."""
+    """Return the derivatives of `load_shift` with respect to the two velocities [s/m]."""
     inv = jax.lax.rsqrt(xi.x**2 + xi.y**2 + 1e-8)
     ahead, left = xi.x * inv, xi.y * inv
     per_speed, mixed = -lead * inv, ahead * left

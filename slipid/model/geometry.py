@@ -139,7 +139,7 @@ class Geometry(Drives):
 
     @property
     def around(self) -> tuple[int, ...]:
-        """Wheels in counter-clockwise order around the robot, beginning with the first."""
+        """Indices of the wheels in counter-clockwise order around the robot, beginning with 0."""
         place = np.asarray(self.place)
         x, y = (place - place.mean(axis=0)).T
         order = np.argsort(np.arctan2(y, x), kind="stable").tolist()

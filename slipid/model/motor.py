@@ -73,7 +73,7 @@ class Motor(eqx.Module):
     def opposing_force(self, motor_force: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
         """Return the force that a motor works against: traction, plus drag in the drive direction.
 
-        `motor_force` has the traction and, before it is multiplied by `rolling_drag`, the drag, as
+        `motor_force` holds the traction, and the drag that would result from `rolling_drag` = 1, as
         `slipid.model.robot.Standing.motor_forces` returns them. The result has the same unit.
         """
         return motor_force[..., 0] + self.rolling_drag * motor_force[..., 1]
@@ -112,7 +112,7 @@ class Motor(eqx.Module):
 def signed(
     current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"], gear_ratio: Array | float
 ) -> Float[Array, " *w"]:
-    """Return currents logged as magnitudes with the sign of the motor speed.
+    """Return currents that were logged as magnitudes, with the sign of the motor speed added.
 
     I = |I| wm / sqrt(wm^2 + w0^2) with the motor speed wm and w0 = `REST`, so that the sign changes
     smoothly. A current that brakes gets the wrong sign.

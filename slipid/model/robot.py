@@ -67,7 +67,7 @@ class Robot(eqx.Module):
         gear_ratio: Number = 1.0,
         mass: Number = 10.0,
     ) -> "Robot":
-        """Return a robot with omni wheels on a circle, driving at their azimuth plus 90 deg.
+        """Return a robot with omni wheels on a circle, each of which drives tangentially.
 
         Args:
             azimuth_deg: azimuths of the wheels, counter-clockwise from ahead [deg].

@@ -1,4 +1,4 @@
-"""Pictures of a camera calibration: coverage by corners, and residuals of points on the floor."""
+"""Figures of a camera calibration: coverage by corners, and residuals of points on the floor."""
 
 from pathlib import Path
 
@@ -14,14 +14,14 @@ from slipid.camera.overhead import OverheadCamera
 from slipid.plots.drawing import BLUE, GREEN, INK, ORANGE, figure, save
 
 ARROW_LENGTH = 0.06
-"""Largest length at which the 95 % quantile of residuals is drawn, as a fraction of picture
+"""Largest length at which the 95 % quantile of residuals is drawn, as a fraction of the image
 width."""
 GRID_STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
 """Possible distances between grid lines drawn on the floor [m]."""
 
 
 def coverage_picture(quality: Quality, path: Path) -> Path:
-    """Write a picture of a lens fit: corners with residuals, and image cells without corners."""
+    """Write a figure of a lens fit: corners with residuals, and image cells without corners."""
     fit, covered = quality.fit, quality.coverage
     width, height = fit.lens.image_px
     title = (
@@ -46,7 +46,7 @@ def coverage_picture(quality: Quality, path: Path) -> Path:
 
 
 def floor_picture(fit: FloorFit, path: Path) -> Path:
-    """Write a picture of the floor's axes and grid as the camera sees them, with residuals.
+    """Write a figure of the floor's axes and grid as the camera sees them, with residuals.
 
     The residuals belong to the points to which the camera's pose was fitted.
     """

@@ -37,14 +37,16 @@ MODEL_NAMES = {
 
 
 def compare_plot(found: Content, out: Path) -> Path:
-    """Write a figure of the ranking under the first kind of held-out runs in comparison.json."""
+    """Write a figure of the ranking for the first kind of held-out runs in comparison.json."""
     question, answer = next(iter(found["questions"].items()))
     made = compare_figure(answer["floors"], SHOWN.get(question, question))
     return drawing.save(made, out / "comparison.png")
 
 
 def compare_figure(floors: Content, which: str) -> Figure:
-    """Draw two panels per floor: log predictive density less the best model's, end-point errors.
+    """Draw the log predictive densities (upper panels) and end-point errors (lower) on each floor.
+
+    The densities are drawn relative to that of the best model.
 
     Args:
         floors: content of comparison.json by floor, for one kind of held-out runs.

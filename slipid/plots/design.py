@@ -121,7 +121,7 @@ def _colour(d: PlannedRun) -> str:
 
 
 def _uncertainty_curves(ax: Axes, saved: Content) -> None:
-    """Draw each curve of the uncertainty over the number of runs, without earlier data."""
+    """Draw the curves of the uncertainty over the number of runs, if no runs were driven before."""
     for key, colour, style, label in CURVES:
         curve = saved["curves"][key]
         std = np.sqrt(curve["criterion"])

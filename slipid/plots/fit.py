@@ -137,7 +137,7 @@ FIGURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
     "current_by_traction": lambda fit, data, measured: current_figure(measured),
     "load_share": lambda fit, data, measured: load_figure(fit),
 }
-"""Functions that draw the figures of a fit, by name; they return None if data are missing."""
+"""Functions that draw the figures of a fit, keyed by name; they return None if data are missing."""
 
 
 def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) -> list[Path]:

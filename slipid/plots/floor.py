@@ -61,7 +61,7 @@ def floor_plot(
 
 
 def _unknown(vector: VectorMap) -> Rectangle:
-    """Return a hatched rectangle as large as the map, visible where the floor is unknown."""
+    """Return a hatched rectangle behind the map, which is visible where the floor is unknown."""
     low_x, low_y, high_x, high_y = vector.region.extent_m
     corner, size = (low_x, low_y), (high_x - low_x, high_y - low_y)
     return Rectangle(corner, *size, facecolor="white", edgecolor=SHADE, hatch=HATCH, lw=0, zorder=0)

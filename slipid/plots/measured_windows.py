@@ -44,7 +44,7 @@ class MeasuredWindows:
         wheel_slip: 1 - (speed over the floor) / (rim speed) [1]; NaN up to a rim travel of
             `SHORTEST_PATH`.
         sideways: ratio of the wheel's sideways rolling speed to its rim speed [1].
-        share: fraction of the weight on the wheel in motion [1].
+        share: fraction of the weight on the wheel at rest [1].
         amps: measured current [A]; None if currents were not logged.
         amps_model: predicted current [A].
         torque: predicted traction torque at the wheel [N m].

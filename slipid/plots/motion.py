@@ -150,8 +150,8 @@ def path_figure(
 def _spread(data: Runs, runs: list[int]) -> list[int]:
     """Return the indices of some of the runs.
 
-    If all runs have headings, they are runs of the most frequent speed, evenly spread over
-    headings.
+    If all runs have headings, the chosen runs have the most frequent speed and are evenly spread
+    over headings.
     """
     heading, speed, most = data.heading[runs], data.speed[runs], OTHER_RUNS
     if np.isfinite(heading).all():

@@ -1,4 +1,4 @@
-"""Figures of uncertainty: posterior draws and profile likelihoods, and Gaussian approximations.
+"""Figures of posterior draws and of profile likelihoods, compared with a Gaussian approximation.
 
 The Gaussian approximation of the posterior has the curvature of the loss at the fit.
 """
@@ -26,7 +26,7 @@ def posterior_plots(found: Posterior, out: Path) -> list[Path]:
 def interval_figure(found: Posterior) -> Figure:
     """Draw 90 % intervals of parameters, from posterior draws and from the fit's covariance.
 
-    They are drawn in prior standard deviations from the prior mean.
+    The intervals are drawn relative to the prior mean, in units of the prior standard deviation.
     """
     fit, z = found.fit, found.flat
     chosen = np.flatnonzero(fit.space.where(lambda e: e.session is None)).tolist()

@@ -73,8 +73,8 @@ def _cloud(ax: Axes, robot: Robot, measured: MeasuredWindows, floor: str) -> Pat
 def driving_torque(robot: Robot, measured: MeasuredWindows) -> np.ndarray:
     """Return the traction torque of each drive per wheel, positive along the wheel's motion [N m].
 
-    It comes from the measured current or, without one, from the prediction. The sign of a current
-    that is logged as a magnitude is that of the prediction.
+    The torque follows from the measured current; if currents were not logged, it is the predicted
+    one. A current that is logged as a magnitude gets the sign of the prediction.
     """
     turning, wheels = np.sign(measured.wheel_speed), robot.geometry.wheels / robot.geometry.drives
     if measured.amps is None:
@@ -94,7 +94,7 @@ def driving_torque(robot: Robot, measured: MeasuredWindows) -> np.ndarray:
 def _curve(ax: Axes, fit: Fit, floor: str) -> None:
     """Draw the slip curve of a floor with its band, and the curve of a wheel that rolls sideways.
 
-    Curves are dashed beyond the largest torque of the runs.
+    Curves are dashed above the largest torque of the runs.
     """
     curve = fit.curves[floor]
     speed, share = curve.wheel_speed, curve.load_share

@@ -3,11 +3,12 @@
 Two questions are answered here: whether a fit that includes runs over several floors still predicts
 the runs on one floor, and how much runs scatter before any physics is fitted to them.
 
-For the scatter, the motion of the body is regressed on smooth functions of the wheels' motion, by
-floor and load set-up: a Fourier series in the direction of travel, the yaw, the change of the
+For the scatter, the motion of the body is regressed on smooth functions of the wheels' motion, for
+each floor and load set-up: a Fourier series in the direction of travel, the yaw, the change of the
 wheels' motion per lag of the camera and, where the position of the marker on the body is fitted,
 the displacement of the marker by turning. Every run is predicted from all other runs with its floor
-and load set-up. The residual in window k of run r, over the distance d_rk, is
+and load set-up. The residual in window k of run r, in which the robot moves by the distance d_rk,
+is
 
     e_rk = a_r d_rk + s_rk,   var a = v_run,   var s_rk = v_process d_rk
 
@@ -18,8 +19,8 @@ expectations:
     sum_rk (e_rk - a^_r d_rk)^2 = v_process sum_r (D_r - sum_k d_rk^2 / D_r)
     sum_r (sum_k e_rk)^2        = v_run sum_r D_r^2 + v_process sum_r D_r
 
-Squares are summed before they are divided by distances: otherwise windows with little motion would
-dominate, in which the noise of the poses is divided by a small distance.
+Squares are summed before they are divided by distances: otherwise windows with little motion, in
+which the noise of the poses would be divided by a small distance, would dominate.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,7 +56,7 @@ ONE_FLOOR_RATIO = 0.8
 """Ratio of the error as if all wheels were on one floor to the error with the map, below which the
 map is rejected."""
 SURE_GROWTH = 3.0
-"""A mean growth of errors above this is not due to chance [standard error of the mean growth]."""
+"""Mean growth of errors, in units of its standard error, above which it is not taken for chance."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,10 @@ class FloorErrors:
     """End-point errors of the runs on one floor, divided by their straight-line displacements.
 
     Attributes:
-        before: error of the fit without runs over several floors.
+        before: error of the fit to only the runs on one floor each.
         after: error of the fit that includes the runs over several floors.
-        is_worse: True if the error grew by more than `WORSE_RATIO` and by more than chance.
+        is_worse: True if the error grew by more than the factor `WORSE_RATIO`, and by more than
+            chance (`SURE_GROWTH`).
     """
 
     before: float
@@ -122,11 +124,13 @@ def end_errors(
 def largest_shift(
     space: Space, before: Search, covariance: Square, after: Search, settled: bool
 ) -> tuple[str, float]:
-    """Return the motion parameter that shifted most, and its shift [std before].
+    """Return the motion parameter that shifted most, and its shift in standard errors.
+
+    Standard errors are those before the shift, from `covariance`.
 
     Parameters of the camera are excluded. The shift is infinite if the fit with the added runs did
     not settle. If the added runs agree with the model, they change a parameter by less than the
-    standard error it had before (Hausman 1978, Econometrica 46(6)).
+    standard error that it had before (Hausman 1978, Econometrica 46(6)).
     """
     known = ~space.electric & ~space.where(lambda e: e.part == "camera")
     sigma = np.where(known, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
@@ -179,11 +183,12 @@ _RIDGE = 1e-6
 
 
 def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
-    """Return the log variance of every noise component, from the scatter or its typical value.
+    """Return the log variance of every noise component.
 
-    The larger of the two is used. All motion that smooth functions of the wheels' motion do not
-    explain counts as noise. On a floor with few runs the scatter is large, as its runs do not
-    predict each other well.
+    The variances of process noise and of run effects are those of the scatter, but at least the
+    typical ones; all others are typical variances. All motion that smooth functions of the wheels'
+    motion do not explain counts as noise. On a floor with few runs the scatter is large, as its
+    runs do not predict each other well.
     """
     w, robot = problem.windows, problem.robot
     distance, _ = travel(w, robot)
@@ -209,7 +214,7 @@ def _unpredicted_motion(
 ) -> Float[np.ndarray, "segment window 3"]:
     """Return the motion along, across and in yaw that other runs do not predict [m, m, rad].
 
-    With `place_is_free` the position of the marker on the body is regressed, too.
+    If `place_is_free`, the position of the marker on the body is regressed, too.
     """
     shape = robot.geometry
     back = np.asarray(shape.pseudo_inverse()).T * float(shape.wheel_radius)

@@ -31,8 +31,8 @@ BOUND_PRECISION = 1e12
 RIDGE = 1e-6
 """Ridge on each coefficient of a monotone curve, relative to the norm of its column.
 
-The ridge has no visible influence on coefficients that the runs determine. It makes all other
-coefficients as small as possible, which rounding errors would determine without it."""
+The ridge has no visible influence on coefficients that the runs determine. All other coefficients
+become as small as possible; without the ridge, rounding errors would determine them."""
 
 
 def current(signals: RunSignals, spec: RobotSpec) -> Slips:
@@ -135,7 +135,7 @@ def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     limits = [(None, None)] * a.shape[1] + [(0, None)] * len(b)
     found = linprog(cost, sides, bound, bounds=limits)
     if not found.success:
-        raise ValueError(f"support vector regression: {found.message}")
+        raise ValueError(f"support vector regression: the linear program failed: {found.message}")
     return np.asarray(found.x[: a.shape[1]])
 
 
@@ -163,8 +163,9 @@ class Saturating(WheelSlip):
 
         torque = soft_torque(w.steps.signals, spec)
         top = float(np.log(max(torque.max(), 1e-3) * 1.5))
-        # The cap of 0.98 causes several minima: hence several starts, and 3-point differences, as
-        # rounding errors of one-sided ones would select the minimum.
+        # The cap of 0.98 causes several minima, so that several starts are tried. Differences are
+        # 3-point ones, as rounding errors of one-sided differences would decide which minimum is
+        # found.
         starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
         tries = [least_squares(errors, x, jac="3-point", max_nfev=200) for x in starts]
         return replace(self, coefficients=min(tries, key=lambda r: r.cost).x)
@@ -181,7 +182,10 @@ def powers(*exponents: int) -> Features:
 
 
 def above(threshold: float) -> Features:
-    """Return the features of the 2021 paper's deployed form: affine above a current, else zero."""
+    """Return features of slip that is affine above a current [A], else zero.
+
+    This is the form that ran on the robot of the 2021 paper (docs/theory.md).
+    """
     return lambda x: np.stack([np.where(x > threshold, x, 0.0), (x > threshold) * 1.0], -1)
 
 

@@ -45,7 +45,8 @@ STEP = 1e-4
 class FittedSlipModel(PredictiveModel):
     """A fitted slip model with its noise variances and the camera of the force balance.
 
-    The model is fitted with the camera's parameters, whose errors propagate to its coefficients.
+    The model is fitted to poses that this camera corrects; errors of the camera's parameters
+    propagate to the model's coefficients.
 
     Attributes:
         model: the slip model, fitted floor by floor.

@@ -32,7 +32,7 @@ class FoldKey:
     """Properties of a run by which folds are made.
 
     Attributes:
-        floor: floor, with the load set-up if that is not the main one (`score.setups`).
+        floor: floor, followed by the load set-up if it is not the main one (`score.setups`).
         heading_deg: commanded direction of travel [deg], nan if unknown.
         speed: commanded speed [m/s], nan if unknown.
     """
@@ -128,8 +128,8 @@ def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
     """Return the fold of every run; -1 for runs that are always fitted and never judged.
 
     Runs with fold -1 lack the property by which runs are held out, or holding out their fold would
-    leave no run of their floor and load set-up. With `parts`, folds whose numbers have the same
-    remainder modulo `parts` are merged.
+    leave no run of their floor and load set-up. If `parts` is given, folds whose numbers have the
+    same remainder modulo `parts` are merged.
 
     Raises:
         DataError: the question is unknown.
@@ -199,7 +199,7 @@ def fit_fold(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> FoldModels:
-    """Return every slip model fitted without the runs `judged`; arguments as in `judge`.
+    """Return every slip model, fitted to all runs except `judged`; arguments as in `judge`.
 
     No measurement of the held-out runs is used.
     """
@@ -222,9 +222,9 @@ def fit_fold(
 def problem_of_runs(
     problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
 ) -> Problem:
-    """Return the problem with those parameters fixed that the runs `fitted` cannot determine.
+    """Return the problem, with viscosities that the runs `fitted` cannot determine fixed near zero.
 
-    `fitted` holds indices of runs of `data`.
+    `fitted` holds indices of runs of `data`; see `fixed_viscosities`.
     """
     fixed = fixed_viscosities(data, fitted)
     return problem.holding(fixed, choices) if fixed else problem
@@ -238,7 +238,7 @@ def judge(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> FoldResult:
-    """Fit every slip model without the runs of one fold, and return its scores on these runs.
+    """Fit every slip model to the runs outside one fold, and return its scores on the fold's runs.
 
     Args:
         problem: problem of all the runs of `data`, made with the choices.

@@ -8,10 +8,10 @@ With (s, 0, d) the body twist J^+ r w of wheels that do not slip, s ahead [m/s] 
     instantaneous_centres   v_x = a s + c d      yaw = b d + e s      v_y = -x yaw
     full_linear             v_x = a s + c d      yaw = b d + e s      v_y = f s - x yaw
 
-a is the relative size of the wheels, 1 / b the relative track (over a), x the position on the
+a is the size of the wheels, and a / b the track, relative to the geometry; x is the position on the
 longitudinal axis about which the robot turns [m]; c and e describe a robot whose sides differ. All
 models but `encoder` are for wheels that do not determine motion sideways (skid steer and
-differential drives): on other robots v_y is not -x yaw. None of them has settings.
+differential drives): on other robots v_y is not -x yaw. None of these models has settings.
 
 Liberties:
     - The five coefficients of the instantaneous centres are equivalent to those of Mandow et al.,
@@ -178,7 +178,7 @@ class HeadingLookup(TwistModel):
         return replace(self, ridge=ridge, coefficients=table.solved(ridge))
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """Return the ridge as a Gaussian prior's precision: penalty over mean squared residual."""
+        """Return the ridge as a Gaussian prior's precision: penalty / mean squared residual."""
         table = self._table(w, spec)
         left = np.mean((table.gap - table.phi @ self.known) ** 2, axis=0)
         weight = table.best_weight() if self.ridge is None else self.ridge
@@ -250,7 +250,10 @@ def _direction(rolling: Float[np.ndarray, "*step 3"]) -> Float[np.ndarray, "*ste
 
 
 def fourier(rolling: Float[np.ndarray, "*step 3"]) -> Float[np.ndarray, "*step k"]:
-    """Return far phi(angle), as in the module docstring, of twists [m/s] or displacements [m]."""
+    """Return the features far phi(angle) of twists [m/s] or of displacements [m].
+
+    The module docstring defines far, phi and angle.
+    """
     angle = _direction(rolling)
     waves = [wave(k * angle) for k in range(1, HARMONICS + 1) for wave in (np.cos, np.sin)]
     far = np.hypot(rolling[..., 0], rolling[..., 1])

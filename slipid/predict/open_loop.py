@@ -53,7 +53,7 @@ class Tracks:
 def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
     """Return the runs, each as one segment of short steps, `RUNS_PER_CALL` at a time.
 
-    The number of steps of a run is a power of two, so that few shapes are compiled.
+    The number of steps of a run is a power of two, so that few array shapes are compiled.
     """
     steps = []
     for k, log in enumerate(data.logs):
@@ -68,7 +68,7 @@ def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
 def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
     """Return the runs, each as one segment of a given number of steps, `RUNS_PER_CALL` at a time.
 
-    The last run of an incomplete group is repeated to fill the group, so that few shapes are
+    The last run of an incomplete group is repeated to fill the group, so that few array shapes are
     compiled.
     """
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
@@ -113,7 +113,7 @@ def end_jacobian(
     twist: Numbers | None = None,
     effects: tuple[Numbers, Numbers] | None = None,
 ) -> Float[Array, "segment 2 free"]:
-    """Return the derivative of end points with respect to the search vector, at fixed start poses.
+    """Return the derivative of end points with respect to the search vector, for fixed start poses.
 
     The path follows body twists (segment, window, 3) if `twist` is given, else the contact
     equilibrium. `effects`, if given, holds the increments by expected shared effects (segment,
@@ -157,7 +157,7 @@ def end_covariance(
     far, u = travel(w, robot)
     p = tracks.predicted
     cov = of_parameters.copy()
-    # The end point shifts by this lever per yaw in each step.
+    # Vector by which the end point shifts per radian of yaw in each step.
     lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])
     way = p[:, :-1, 2]
     along, across = turned(way, u), turned(way, turned_left(u))

@@ -63,7 +63,7 @@ class PredictiveModel(abc.ABC):
     """A fitted model with its noise variances, so that it predicts distributions.
 
     Attributes:
-        robot: the fitted robot, for its camera and geometry.
+        robot: the fitted robot, of which the camera and the geometry are used.
         variance: variances, keyed by name, of every noise component and of any session effects.
         covariance: covariance of the model's parameters, followed by those of the camera.
     """
@@ -80,7 +80,10 @@ class PredictiveModel(abc.ABC):
     @property
     @abc.abstractmethod
     def numbers(self) -> dict[str, int]:
-        """Number of fitted parameters of each floor, and of those `shared` by all; no camera's."""
+        """Number of fitted parameters, keyed by floor, or `shared` for those of all floors.
+
+        Parameters of the camera are not counted.
+        """
 
     def log_variance(self, problem: Problem) -> Float[np.ndarray, " variance"]:
         """Return the log variance of every noise component of a problem."""
@@ -104,7 +107,7 @@ class PredictiveModel(abc.ABC):
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, numbers)
 
     def scale(self, problem: Problem) -> tuple[Residuals, Float[np.ndarray, "segment m m"]]:
-        """Return the residuals of every segment, and the scale matrix of their distribution."""
+        """Return every segment's residuals, and the scale matrix of their Student t."""
         residual, slope = self.linear(problem)
         noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
@@ -113,11 +116,14 @@ class PredictiveModel(abc.ABC):
         return residual, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
 
     def _number_covariance(self, w: Windows, slope: Slopes) -> Float[np.ndarray, "segment m m"]:
-        """Return the covariance due to uncertain parameters, times `growth`."""
+        """Return the covariance of predictions due to uncertain parameters, times `growth`."""
         return self.growth(w)[:, None, None] * parameter_covariance(slope, self.covariance)
 
     def growth(self, w: Windows) -> Float[np.ndarray, " segment"]:
-        """Return the factor of parameter and shared-effect variances for runs not fitted."""
+        """Return each segment's factor on the variances of parameters and of shared effects.
+
+        A factor above one accounts for runs unlike those that were fitted.
+        """
         return np.ones(len(w))
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "segment 3 3"]:
@@ -127,7 +133,7 @@ class PredictiveModel(abc.ABC):
     def log_density(self, problem: Problem) -> Float[np.ndarray, " segment"]:
         """Return the predictive log density of each segment's logged poses, given its first pose.
 
-        The density is per logged unit of position and heading.
+        The density is per unit of the logged position and heading, before the camera corrects them.
         """
         return log_student(*self.scale(problem)) + np.asarray(
             lk.camera_log_jacobian(self.robot, problem.batch.pose)
@@ -137,7 +143,7 @@ class PredictiveModel(abc.ABC):
 def log_student(
     residual: Residuals, scale: Float[np.ndarray, "segment m m"] | Float[np.ndarray, "m m"]
 ) -> Float[np.ndarray, " segment"]:
-    """Return the log density of a multivariate Student t around zero, `DEGREES` degrees of freedom.
+    """Return the log density of a Student t around zero with `DEGREES` degrees of freedom.
 
     Source: Kotz and Nadarajah 2004, Multivariate t Distributions, eq. 1.1.
     """
@@ -210,7 +216,7 @@ class ForceBalance(PredictiveModel):
 
     @cached_property
     def camera(self) -> np.ndarray:
-        """Coordinates of the search vector that belong to the camera."""
+        """Indices of the search vector's elements that belong to the camera."""
         return np.flatnonzero(self.space.where(lambda e: e.part == "camera"))
 
     def linear(self, problem: Problem) -> tuple[Residuals, Slopes]:
@@ -220,10 +226,10 @@ class ForceBalance(PredictiveModel):
         return np.asarray(blocks["motion"]) - residual, np.asarray(jac["motion"]) - slope
 
     def _correction(self, w: Windows) -> tuple[Residuals, Slopes]:
-        """Return the change of increments by expected effects, and its derivative.
+        """Return the part of residuals that expected shared effects explain, and its derivative.
 
-        The derivative is with respect to the search vector. Both are to be subtracted from the
-        predictions of the contact law.
+        The derivative is with respect to the search vector. Residuals are predicted less measured
+        increments: both results are therefore subtracted from the contact law's predictions.
         """
         expected, e = self.expected_effects(w), effects(w, self.robot)
         mean = np.einsum("nma,na->nm", e, expected.mean)
@@ -246,7 +252,7 @@ class ForceBalance(PredictiveModel):
 def force_balance_of(
     problem: Problem, state: FitState, covariance: Square, keep: Float[np.ndarray, " segment"]
 ) -> ForceBalance:
-    """Return the force balance as fitted to the kept segments, with its shared effects."""
+    """Return the force balance that was fitted to the segments `keep`, with its shared effects."""
     z, log_v, w = np.asarray(state.z), np.asarray(state.log_variance), problem.windows
     residual, jacobian = problem.linear(z, problem.electric(z, log_v))
     motion = residual["motion"], jacobian["motion"]

@@ -75,7 +75,7 @@ class Ranking:
         runs: number of runs.
         clusters: number of sectors of headings.
         best: name of the best model.
-        sentence: summary for a reader.
+        sentence: summary in one sentence, for people.
         band50, band90: range in which the coverage of calibrated forecasts lies, see `_band`.
         models: scores of every model, keyed by name.
     """
@@ -229,7 +229,7 @@ def compared(
 
 
 LEAST_SPEED_RATIO = 0.2
-"""A wheel is used in a window if its speed is at least this fraction of the fastest wheel's."""
+"""Smallest fraction of the fastest wheel's speed at which a wheel is used in a window."""
 VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "all": (LEAST_SPEED_RATIO, False, False),
     "slower wheels too": (0.1, False, False),
@@ -237,8 +237,10 @@ VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "as built only": (LEAST_SPEED_RATIO, True, False),
     "0 < s <= 1, I > 0.25 A only": (LEAST_SPEED_RATIO, False, True),
 }
-"""Choices of rows for `transfer`, keyed by name: (smallest relative wheel speed, main load set-up
-only, filter of the 2021 paper).
+"""Rows that `transfer` uses, keyed by the name of the choice.
+
+A choice holds the smallest wheel speed relative to the fastest wheel's, True for only the main load
+set-up, and True for the filter of the 2021 paper: 0 < s <= 1 and I > 0.25 A.
 
 The filter truncates the slip and therefore underestimates the remaining errors.
 """
@@ -247,10 +249,11 @@ The filter truncates the slip and therefore underestimates the remaining errors.
 def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
     """Return leave-one-floor-out errors of slip, keyed by `VARIANTS`; empty for a single floor.
 
-    A variant holds the errors of slip less the curve of the other floors (`pooled`), less the mean
-    slip of the other floors (`constant`) and less the floor's own curve (`per_surface`), and the
-    `count` of rows. Each error is given as the root mean square over all `rows`, as that over the
-    rows of `each` floor, and as the mean of the values of `each` (`floors`).
+    The errors of a variant are the slip less the curve fitted to the other floors (`pooled`), the
+    slip less the mean slip on the other floors (`constant`), and the slip less the curve fitted to
+    the floor itself (`per_surface`); `count` is the number of rows. Each error is given as the root
+    mean square over all `rows`, as the root mean square over the rows of `each` floor, and as the
+    mean of the values in `each` (`floors`).
 
     A row is one wheel in one window, with the slip s = 1 - J xi / (r w), where xi is the body twist
     from the camera in corrected metres, and the mean magnitude I of the wheel's current.

@@ -101,8 +101,8 @@ def forecast(
 
     The level is the probability of the predicted region on whose boundary the end point lies; an
     end point lies in the 90 % region if the level is at most 0.9. The predictive distribution is a
-    Student t with scale matrix `cov` and `freedom` degrees of freedom. For `cov` None there is no
-    level, and the energy score is the distance itself, as for a point forecast. Source: Gneiting
+    Student t with scale matrix `cov` and `freedom` degrees of freedom. If `cov` is None, there is
+    no level, and the energy score is the distance itself, as for a point forecast. Source: Gneiting
     and Raftery 2007, JASA 102, eq. 22.
     """
     if cov is None:
@@ -137,7 +137,7 @@ def clusters(heading_deg: Sequence[float | None]) -> Int[np.ndarray, " run"]:
 def mean_error(
     value: Float[np.ndarray, " run"], cluster: Int[np.ndarray, " run"]
 ) -> tuple[float, float, float]:
-    """Return the mean, its standard error over runs, and that over clusters of runs.
+    """Return the mean, its standard error over runs, and its standard error over clusters.
 
         se^2 = G / (G - 1) sum_g (sum_{i in g} (x_i - mean))^2 / n^2
 

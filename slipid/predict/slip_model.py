@@ -31,7 +31,7 @@ def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
 def body_twist(w: Windows, robot: Robot) -> np.ndarray:
     """Return the measured body twist of every window [m/s, m/s, rad/s], from marker poses.
 
-    The yaw and the position of the marker on the body are removed.
+    The effects of the marker's yaw and position on the body are removed.
     """
     moved = np.asarray(measured_increments(robot, jnp.asarray(w.pose)))
     yaw = moved[..., 2]
@@ -46,7 +46,7 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
 
 
 def setups(w: Windows) -> list[str]:
-    """Return the floor and load of every segment, `floor@load`."""
+    """Return the floor and load set-up of every segment as `floor@load`."""
     return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]
 
 
@@ -76,19 +76,21 @@ TRIES = 4
 WINDOW_S = 0.5
 """Length of the windows on which models are trained and twists are judged [s]."""
 SHAFT_W0 = 3.0
-"""Motor shaft speed w0 below which M = U I / w, which is infinite at rest, is reduced [rad/s]."""
+"""Motor shaft speed w0 below which `RunSignals.torque` reduces M = U I / w [rad/s].
+
+Without this reduction, M would be infinite at rest."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobotSpec:
-    """Properties of a robot that are known before anything is fitted.
+    """Properties of a robot that are known before a slip model is fitted.
 
     A drive is a motor with all the wheels that it turns: one wheel, or a side of a skid steer.
 
     Attributes:
-        forward: J, which gives the rim speed of each drive [m/s] from the body twist.
-        back: J^+, which gives the body twist from the drives' rim speeds without slip, by least
-            squares.
+        forward: matrix J that maps the body twist to the rim speed of each drive [m/s].
+        back: pseudo-inverse J^+ that maps the drives' rim speeds to the body twist by least
+            squares, as if no wheel slipped.
         wheel_radius, base_radius: radius of the wheels, and base radius of the geometry [m].
         gear_ratio: motor turns per wheel turn.
         resistance, back_emf: constants of the motor from its datasheet [ohm], [V s/rad].
@@ -109,7 +111,7 @@ class RobotSpec:
 
     @classmethod
     def of(cls, robot: Robot) -> "RobotSpec":
-        """Return the properties of a robot as in its config."""
+        """Return the properties of a robot from its geometry, motor and body."""
         shape, motor = robot.geometry, robot.motor
         back = np.asarray(shape.pseudo_inverse())
         return cls(
@@ -131,7 +133,7 @@ class RobotSpec:
 
     @property
     def size(self) -> Float[np.ndarray, "3"]:
-        """Weights (1, 1, base radius [m]) that convert a twist to three speeds."""
+        """Weights (1, 1, base radius [m]) that convert a twist to three speeds [m/s]."""
         return np.array([1.0, 1.0, self.base_radius])
 
 
@@ -187,7 +189,7 @@ class RunSignals:
         return np.asarray(self.current * np.sign(self.speed) if signed else self.current)
 
     def torque(self, spec: RobotSpec, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
-        """Return the torque characterising variable M of the 2021 paper [N m].
+        """Return the torque characterising variable M of the 2021 paper (docs/theory.md) [N m].
 
         M = U I / w with the voltage U = C_e w + R I, the current I and the shaft speed w. So that M
         is finite at rest, it is computed as C_e I + R I^2 w / (w^2 + w0^2) with w0 = `rest`. M is
@@ -298,7 +300,7 @@ class SlipModel(abc.ABC):
     aim: Aim = field(default="end", kw_only=True)
 
     def candidates(self) -> Sequence["SlipModel"]:
-        """Return at most `TRIES` models with different settings, to choose by cross-validation."""
+        """Return at most `TRIES` models, differing in settings; cross-validation selects one."""
         return (self,)
 
     @abc.abstractmethod
@@ -307,7 +309,7 @@ class SlipModel(abc.ABC):
 
     @abc.abstractmethod
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        """Return predictions of runs that were not fitted, from only their signals."""
+        """Return predictions of runs that were not fitted, from their signals only."""
 
     @property
     @abc.abstractmethod
@@ -316,7 +318,7 @@ class SlipModel(abc.ABC):
 
 
 def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:
-    """Return the first step of every group of neighbouring steps, each about `seconds` [s] long."""
+    """Return the index of the first step of every group of steps, about `seconds` [s] long."""
     count = max(1, round(float(dt.sum()) / seconds))
     number = np.minimum((np.cumsum(dt) - 0.5 * dt) / dt.sum() * count, count - 1).astype(int)
     return np.flatnonzero(np.diff(number, prepend=-1))

@@ -32,7 +32,7 @@ from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 class FloorModels:
     """A slip model fitted separately for every floor.
 
-    The model predicts marker increments in metres as corrected by the camera model.
+    Predicted marker increments are compared with poses that the fitted camera corrects.
 
     Attributes:
         model: the slip model, not fitted.
@@ -50,11 +50,11 @@ class FloorModels:
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """Fitted coefficients, keyed as `fitted`; with the name they restore the models."""
+        """Coefficients with the keys of `fitted`, from which `restored` rebuilds the models."""
         return {key: m.coefficients for key, m in self.fitted.items() if m.coefficients is not None}
 
     def with_state(self, state: Mapping[str, np.ndarray]) -> "FloorModels":
-        """Return the models with these coefficients."""
+        """Return the models with coefficients in the form of the property `state`."""
         models = {
             k: replace(self.fitted.get(k, self.model), coefficients=v) for k, v in state.items()
         }
@@ -105,7 +105,7 @@ class FloorModels:
         return floors[surface]
 
     def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
-        """Return the precision that ridges and bounds give to coefficients, keyed as `fitted`."""
+        """Return the precision that ridges and bounds add to coefficients; keys as in `fitted`."""
         spec, parts = RobotSpec.of(robot), self._parts(w)
         return {
             key: model.stiffness(training_windows(parts[key], robot), spec)
@@ -119,7 +119,7 @@ class FloorModels:
 
 
 def steps_of(w: Windows) -> Steps:
-    """Convert windows to steps: every segment becomes one run, and currents their magnitudes."""
+    """Convert windows to steps: segments become runs, and currents become their magnitudes."""
     drives = w.turn.shape[-1]
     signals = RunSignals(
         name="windows",
@@ -132,15 +132,15 @@ def steps_of(w: Windows) -> Steps:
 
 
 def training_windows(w: Windows, robot: Robot) -> TrainingWindows:
-    """Return the windows with their measured body twists, every window as one step."""
+    """Return training windows of one step each, with their measured body twists."""
     twist, run = body_twist(w, robot).reshape(-1, 3), np.repeat(w.run, w.dt.shape[1])
     return TrainingWindows(steps_of(w), np.arange(w.dt.size), w.dt.ravel(), twist, run)
 
 
 LEAST_RUNS = 5
-"""Smallest number of runs on a floor, or with a load set-up, to which a model is fitted.
+"""Smallest number of runs on a floor, or with a load set-up, to which a model is fitted separately.
 
-Groups with fewer runs use the fit to all runs.
+Groups with fewer runs use the model fitted to all runs.
 """
 KNOTS = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)
 """Knots of the monotone spline [N m]."""
@@ -151,14 +151,14 @@ PAPER_THRESHOLD = 0.4
 def slip_models(
     shape: Geometry, has_current: bool, together: Together | None = None
 ) -> list[FloorModels]:
-    """Return every slip model that the logs and the wheels allow, not fitted.
+    """Return every slip model, before its fit, that the logged channels and the wheels allow.
 
     The model `paper` is the form that the authors of the 2021 paper ran on their robot; its
-    threshold and the knots of the spline suit motors of the size of theirs.
+    threshold, and the knots of the spline, suit motors of similar size.
 
     Args:
-        shape: geometry of the robot as in its config. For wheels that do not determine the twist
-            there are other models than for those that do.
+        shape: geometry of the robot as in its config. Wheels that do not determine the twist
+            have other models than wheels that do.
         has_current: True if currents are logged.
         together: group number of every run; a model's inner cross-validation holds out the runs of
             a group together.
@@ -203,13 +203,13 @@ def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> l
 class ByFloor(SlipModel):
     """A slip model fitted to each floor separately if floors are known, else to each load set-up.
 
-    Groups of fewer than `LEAST_RUNS` runs use the fit to all runs.
+    Groups of fewer than `LEAST_RUNS` runs use the model fitted to all runs.
 
     Attributes:
         method: the model, not fitted.
         pooled: True if floors and loads are ignored and the model is fitted once to all runs.
         fitted: the model fitted to the runs of each group, keyed by the group's name, the largest
-            group first; the name of the group of all runs is None.
+            group first; if `pooled`, the only key is None.
     """
 
     method: SlipModel
@@ -244,7 +244,7 @@ class ByFloor(SlipModel):
         return [found[k] for k in range(len(runs))]
 
     def _fitted_group(self, signals: RunSignals) -> str | None:
-        """Return the group of a run; the largest group for a load set-up without training runs.
+        """Return the group of a run, or the largest group if its load set-up was not trained.
 
         Raises:
             ValueError: the floor of the run was not fitted.

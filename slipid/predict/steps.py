@@ -28,7 +28,7 @@ class Steps:
 
     Attributes:
         signals: all steps as if they were one run; its name and floor are those of the first run.
-        first: first step of each run.
+        first: index of the first step of each run.
         speed_change: wheel speed at the end of each step less that at its start [rad/s], so that d
             turn / d lag = -speed_change; None if the lag of the poses is known.
         lag: assumed lag of the poses behind the wheels [s].
@@ -62,7 +62,10 @@ class Steps:
         return cls(signals, np.cumsum([0, *(len(run) for run in runs[:-1])]))
 
     def at_lag(self, lag: float) -> "Steps":
-        """Return the steps at another lag [s], to first order; unchanged without `speed_change`."""
+        """Return the steps at another lag [s], to first order.
+
+        They are unchanged if `speed_change` is None.
+        """
         if self.speed_change is None:
             return self
         turn = self.signals.turn - (lag - self.lag) * self.speed_change
@@ -87,7 +90,7 @@ class Steps:
     def smoothed(
         self, values: Float[np.ndarray, "step drive"], time_constant: float
     ) -> Float[np.ndarray, "step drive"]:
-        """Return a first-order low pass of each run, which starts at the run's first value.
+        """Return each run's values after a first-order low pass, which starts at the first value.
 
         x~_k = a x~_(k-1) + (1 - a) x_k   with   a = exp(-dt / time constant [s])
         """
@@ -107,7 +110,7 @@ class Steps:
         return np.stack([run.path[-1] for run in self.predicted(twist)])
 
     def _runs(self, values: np.ndarray) -> list[np.ndarray]:
-        """Return the values of all steps, run by run."""
+        """Split the values of all steps into one array per run."""
         return np.split(values, self.first[1:])
 
 
@@ -238,5 +241,5 @@ class TwistModel(SlipModel, abc.ABC):
             ValueError: the model is not fitted.
         """
         if self.coefficients is None:
-            raise ValueError(f"{self.name}: not fitted")
+            raise ValueError(f"{self.name}: not fitted; call `fit` first")
         return self.coefficients

@@ -66,7 +66,7 @@ def plain_values(values: Iterable[tuple[str, object]]) -> Content:
 
 @dataclass(frozen=True)
 class FloorSummary:
-    """Mean or median scores of a model over the runs on a floor; single scores are in `Score`."""
+    """Mean or median scores of a model over the runs on a floor; `Score` defines the scores."""
 
     endpoint_error_mean: float
     endpoint_error_median: float
@@ -136,7 +136,7 @@ def validation(
     is the number of runs that were not fitted.
 
     Raises:
-        DataError: a run on a floor or with a load set-up that was not identified.
+        DataError: the floor or the load set-up of a run was not identified.
     """
     _known(fit.robot, data)
     runs: dict[int, ScoredRun] = {}
@@ -198,9 +198,9 @@ def finite(x: float) -> float | None:
 
 
 def by_floor(runs: Sequence[ScoredRun]) -> dict[str, list[ScoredRun]]:
-    """Return the runs, keyed by floor, or by `<floor>@<load>` without the main load set-up.
+    """Return the runs in groups, keyed by the names that `score.setups` gives them.
 
-    The main load set-up is that of `score.main_load`.
+    A name is the floor, or `<floor>@<load>` if the load set-up is not the main one.
     """
     groups: dict[str, list[ScoredRun]] = {}
     for name, run in zip(

@@ -55,7 +55,7 @@ def key_of(*parts: object) -> str:
 
     Args:
         parts: arrays, bytes, and values whose `repr` is complete: numbers, strings, plain
-            containers and dataclasses of those. The `repr` of an array inside a container is
+            containers and dataclasses of these. The `repr` of an array inside a container is
             abbreviated, so every array must be a separate part.
     """
     mark = hashlib.sha256()

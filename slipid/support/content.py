@@ -3,5 +3,5 @@
 from typing import Any
 
 Content = dict[str, Any]
-"""Content of a JSON or TOML file, or of a table in it: numbers, texts, lists and tables keyed by
+"""Content of a JSON or TOML file, or of a table in it: numbers, strings, lists and tables keyed by
 name."""

@@ -43,13 +43,13 @@ def bad_data(
 def did_you_mean(name: object, choices: Iterable[str]) -> str:
     """Return `, did you mean this or that?` with the choices most similar to a name.
 
-    The text is empty if no choice is similar.
+    The string is empty if no choice is similar.
     """
     found = get_close_matches(str(name), list(choices), n=2)
     return f", did you mean {' or '.join(found)}?" if found else ""
 
 
 def first_names(names: Iterable[str], none: str = "none") -> str:
-    """Return the first twelve names as a text for a message, or `none` if there are no names."""
+    """Return the first twelve names as a string for a message, or `none` if there are no names."""
     every = list(names)
     return ", ".join(every[:12] + ["..."] * (len(every) > 12)) or none

@@ -38,8 +38,8 @@ class InProcess(Executor):
 class Processes(ProcessPoolExecutor):
     """Executor with processes on this machine, which are started on demand.
 
-    They end when the process that started them is interrupted or killed. They are spawned, not
-    forked, since forked processes would inherit the threads of the caller's libraries.
+    The processes end when the process that started them is interrupted or killed. They are spawned,
+    not forked, since forked processes would inherit the threads of the caller's libraries.
     """
 
     def __init__(self, jobs: int) -> None:
@@ -101,7 +101,8 @@ def results(
         collect(as_completed(list(waiting)))
     except BrokenExecutor as error:
         raise DataError(
-            "a process ended before its job (too little memory?); run the command again to continue"
+            "a worker process ended before its job was finished (was there too little memory?); "
+            "run the command again, which continues after the finished jobs"
         ) from error
     return found
 

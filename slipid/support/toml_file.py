@@ -161,7 +161,7 @@ def _members(annotation: object) -> list[object]:
 
 
 def _annotations(kind: object) -> dict[str, object]:
-    """Return the type of each key of a model or a dataclass; empty for other types."""
+    """Return the type of each key of a model or a dataclass; an empty dict for other types."""
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return {f.alias or name: f.annotation for name, f in kind.model_fields.items()}
     if isinstance(kind, type) and is_dataclass(kind):

@@ -57,8 +57,8 @@ TIME_CONSTANT_STD_S = 2e-3
 MOMENTS = (len(VOLTS) - 1, len(AMPS))
 """Number of moments of the electrical and of the mechanical equation.
 
-The last signal of both, the sign given to unsigned currents, is an instrument in the mechanical
-equation only."""
+The last signal of both equations is the sign given to unsigned currents; it multiplies residuals
+only in the mechanical equation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +125,8 @@ class _Objective(eqx.Module):
     Attributes:
         space: free parameters with their priors.
         root: S^-1/2, which whitens the moments.
-        constant: h of each equation, the mechanical one last.
-        slope: G of each equation.
+        constant: vector h of each equation (`Equation`), the mechanical equation last.
+        slope: matrix G of each equation.
     """
 
     space: Space
@@ -254,7 +254,7 @@ def _solved(
 def _searched(
     z: Float[Array, " free"], held: _Objective, tangents: _Objective
 ) -> tuple[Array, Array]:
-    """Return the optimum, and the Jacobian there of the residuals with `tangents` as arguments."""
+    """Return the optimum of `held`, and the Jacobian there of the residuals of `tangents`."""
     solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
     found = optx.least_squares(_residuals, solver, z, args=held, max_steps=200, throw=False)
     return found.value, jax.jacfwd(_residuals)(found.value, tangents)

@@ -5,8 +5,9 @@ in its even (e) and its odd (o) rows. At the true parameters p
 
     E g = 0,    g(p) = sum over windows of (w_e z_o r_e(p) + w_o z_e r_o(p)) / 2,
 
-whatever the noise of voltage, current and speed, which has no influence on the mean. (The normal
-equations of least squares have E sum z r = -n R sigma_I^2 instead of 0, and their R is too small.)
+whatever the noise of voltage, current and speed, since r and z come from different rows. (The
+normal equations of least squares have E sum z r = -n R sigma_I^2 instead of 0, and their R is too
+small.)
 As r is linear in the coefficients k(p),
 
     g(p) = h - G k(p).
@@ -53,8 +54,8 @@ class Equation:
 
     Attributes:
         windows: windows of the records, with the signals of the equation.
-        constant: h.
-        slope: G.
+        constant: vector h.
+        slope: matrix G.
         tangent: -dg / dk, including the change of weights; it determines the uncertainty of k.
         residual: residual of every window [V] or [A], from its even and from its odd rows.
         weight: weight of every residual.
@@ -87,7 +88,7 @@ class Equation:
 
     @property
     def weighted_residual(self) -> Float[np.ndarray, " window"]:
-        """Weighted mean of the residuals of both halves."""
+        """Weighted residual of each window, averaged over even and odd rows."""
         return (self.weight * self.residual).sum(axis=0) / 2
 
 
@@ -111,7 +112,7 @@ def equation(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signal
 
 
 def start(w: BenchWindows, count: int, rounds: int = 12) -> np.ndarray:
-    """Return coefficients for which the first `count` moments vanish; further ones are 0."""
+    """Return coefficients for which the first `count` moments vanish; all others are 0."""
     found = np.zeros(w.signals.shape[-1])
     weights = [w.usable.astype(float)] * 2
     for _ in range(rounds):
@@ -128,7 +129,7 @@ def start(w: BenchWindows, count: int, rounds: int = 12) -> np.ndarray:
 def _weighted(
     w: BenchWindows, half: int, coefficients: Float[np.ndarray, " column"]
 ) -> tuple[Float[np.ndarray, " window"], float, Float[np.ndarray, " window"]]:
-    """Return the residuals of one half of the rows, their robust std, and their weights.
+    """Return residuals from the even (`half` 0) or odd rows (1), their robust std and weights.
 
     The std is at least 1e-9, the size of rounding errors in sums.
     """
@@ -151,7 +152,7 @@ def celled(
 
 
 def cell_length(windows: Sequence[BenchWindows]) -> float:
-    """Return the length of the cells of time [s], at least two strides between windows."""
+    """Return the length of the cells of time [s], at least twice the time between windows."""
     strides = [float(np.median(np.diff(w.time))) for w in windows if len(w.time) > 1]
     return max(CELL_S, *(2 * s for s in strides))
 

@@ -105,8 +105,8 @@ _NUMBERS_OF = {
 }
 """Paths of the parameters that the equation of each channel determines."""
 ONE_SPEED_RATIO = 0.05
-"""A log has a single operating point if its range of speeds, over the largest speed, is below
-this."""
+"""Range of a log's speeds, divided by the largest speed, below which the log has only one operating
+point."""
 SLOW_ROWS_S = 1.0
 """Time between rows above which a message asks whether the unit of time is right [s]."""
 _REMEDIES = (
@@ -134,8 +134,8 @@ class BenchFit:
 
     Attributes:
         fits: fit of each motor.
-        parameters: estimates, keyed by path, with `@label` of a motor.
-        derived: quotients of parameters, keyed by path, with `@label` of a motor.
+        parameters: estimates, keyed by path, which ends in `@label` if the motor has a label.
+        derived: quotients of parameters, keyed by path, whose two parts end in `@label`.
         messages: warnings, one sentence each.
         misfits: sentences on misfits, keyed by label of the motor and by channel.
     """
@@ -215,7 +215,7 @@ def _remedy(paths: Sequence[str], has_voltage: bool) -> str:
 
 
 def _too_slow(f: MotorFit) -> dict[str, str]:
-    """Return sentences, keyed by path, on parameters with time constants too short for the rows."""
+    """Return sentences on time constants that are too short for the rows, keyed by parameter."""
     m, rows, slow = f.motor, f.period, {}
     if not f.has_voltage:
         return {}
@@ -265,7 +265,7 @@ def _with_verdict(
 
 
 def _remarks(f: MotorFit) -> list[str]:
-    """Return further warnings."""
+    """Return warnings on the operating points, channels and sampling of the logs."""
     found = []
     if _one_point(f):
         found.append(
@@ -274,8 +274,8 @@ def _remarks(f: MotorFit) -> list[str]:
         )
     if not f.has_voltage:
         found.append(
-            "without a voltage neither resistance nor back-EMF is identified, and friction and "
-            f"inertia only relative to the back-EMF; {VOLTAGE}"
+            "without a voltage neither resistance nor back-EMF is identified; friction and inertia "
+            f"are identified only relative to the back-EMF; {VOLTAGE}"
         )
     if not all(r.signed for r in f.records):
         found.append(

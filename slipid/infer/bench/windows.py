@@ -28,8 +28,8 @@ ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
 LEAST_ROWS, ENOUGH_ROWS = 2, 8
 """Smallest and desired half length of a window [row].
 
-A slope from odd rows needs at least `LEAST_ROWS`. Windows with fewer rows than `ENOUGH_ROWS` are
-lengthened to it, but not beyond the windows of the mechanical equation (`MECHANICAL_S`).
+A slope from odd rows needs at least `LEAST_ROWS`. Shorter half lengths than `ENOUGH_ROWS` are
+extended to it, but not beyond that of the mechanical equation (`MECHANICAL_S`).
 """
 MOST_WINDOWS = 20_000
 """Largest number of windows of one record."""
@@ -37,17 +37,16 @@ LONG_WINDOW_RATIO = 4
 """Ratio of the length of the longer windows, whose means give the signs of small currents, to the
 length of windows."""
 GAP_RATIO = 1.5
-"""A window spans a gap between rows if its duration exceeds this multiple of the nominal one."""
+"""Ratio of a window's duration to its nominal one above which the window spans a gap in time."""
 JUMP_STDS = 6.0
-"""A larger step of the voltage between rows counts as a jump [robust std of steps]."""
+"""Step of the voltage between rows above which it counts as a jump [robust std of steps]."""
 SETTLED_S, SETTLED_ROWS = 5e-3, 4
 """Time after a jump of the voltage until currents are straight lines between rows [s], [row].
 
 The shorter of the two applies.
 """
 BRAKING_STDS = 4.0
-"""The motor may be braking if the shaft decelerates by more than this [robust std of
-accelerations]."""
+"""Deceleration of the shaft above which the motor may be braking [robust std of accelerations]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +78,8 @@ class BenchWindows:
 def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | None:
     """Return windows of the electrical equation [V], None without voltages.
 
-    `zero` is the reading of the ammeter at zero current [A], from which small currents get their
-    signs.
+    `zero` is the reading of the ammeter at zero current [A]; the signs of small currents are those
+    of their readings less `zero`.
     """
     parts = []
     for k, r in enumerate(records):
@@ -124,9 +123,9 @@ class _RecordWindows:
     """Windows of a record, and means and slopes of its signals in them, from even and odd rows.
 
     Attributes:
-        middle: middle row of each window.
+        middle: index of the middle row of each window.
         half: half the length of a window [row].
-        rows: even, and odd, rows of every window.
+        rows: indices of the even rows, then of the odd rows, of every window.
     """
 
     def __init__(self, r: BenchRecord, half_s: float):
@@ -213,5 +212,5 @@ def _jumps(
 def _joined(parts: Sequence[BenchWindows]) -> BenchWindows:
     """Return the windows of several records, one after the other."""
     fields = zip(*(vars(part).values() for part in parts), strict=True)
-    # Windows are the first axis of a field, or the second one after the axis of halves.
+    # The axis of windows is the first of a field, or the second if the axis `half` comes first.
     return BenchWindows(*(np.concatenate(x, axis=min(x[0].ndim, 2) - 1) for x in fields))

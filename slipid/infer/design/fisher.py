@@ -29,10 +29,11 @@ class RunJacobians(NamedTuple):
     """Whitened Jacobians of runs.
 
     Attributes:
-        motion: J, derivative of motion residuals with respect to the motion parameters.
-        electric: E, derivative of currents and voltages with respect to the electric parameters (k
-            is 0 without currents).
-        carried: C, derivative of currents and voltages with respect to the motion parameters.
+        motion: matrix J, the derivative of motion residuals with respect to the motion parameters.
+        electric: matrix E, the derivative of currents and voltages with respect to the electric
+            parameters; k is 0 if no currents are logged.
+        carried: matrix C, the derivative of currents and voltages with respect to the motion
+            parameters.
     """
 
     motion: Float[np.ndarray, "run m motion"]
@@ -53,9 +54,9 @@ class Information:
 
     Attributes:
         is_electric: mask of the electric parameters.
-        motion: M, information about the motion parameters.
-        own: O, information about the electric parameters given the motion.
-        cross: X, cross information that relates errors of electric and of motion parameters.
+        motion: matrix M, the information about the motion parameters.
+        own: matrix O, the information about the electric parameters given the motion.
+        cross: matrix X, which relates errors of electric parameters to those of motion parameters.
     """
 
     is_electric: Bool[np.ndarray, " free"]
@@ -64,7 +65,7 @@ class Information:
     cross: Float[np.ndarray, "electric motion"]
 
     def plus(self, rows: RunJacobians, times: float = 1.0) -> "Information":
-        """Return the information after adding these runs `times` times; -1 removes the runs."""
+        """Return the information after adding these runs `times` times; `times` -1 removes them."""
         # The number of rows is given, as reshape(-1, ...) would fail for arrays without columns.
         j, e, c = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in rows)
         return Information(

@@ -70,7 +70,7 @@ def candidates(
     headings_deg: Sequence[float] = HEADINGS,
     turns: Sequence[float] | None = None,
 ) -> tuple[PlannedRun, ...]:
-    """Return candidate runs: straight and curved in all headings and speeds, and on the spot.
+    """Return candidates: straight and curved runs in all headings and speeds, turns on the spot.
 
     Args:
         setups: floors and load set-ups.
@@ -79,7 +79,8 @@ def candidates(
         base_radius: distance of the wheels from the robot's centre [m].
         headings_deg: directions of travel [deg].
         turns: yaw rates [rad/s]. By default, runs with a speed have zero and plus or minus
-            `BEND_RATIO` * speed / base radius; turns on the spot plus or minus speed / base radius.
+            `BEND_RATIO` * speed / base radius; turns on the spot have plus or minus speed / base
+            radius.
     """
     out = []
     for surface, load in setups:
@@ -115,7 +116,10 @@ def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[
 def heading_grid(
     setups: Iterable[Setup], speeds: Mapping[str, Sequence[float]], distance: Mapping[str, float]
 ) -> tuple[PlannedRun, ...]:
-    """Return straight runs in headings 5 degrees apart at every speed, as in the 2022 logs."""
+    """Return straight runs in headings 5 degrees apart at every speed, as in the 2022 logs.
+
+    docs/results.md describes these logs.
+    """
     headings = np.radians(np.arange(0.0, 360.0, 5.0))
     return tuple(
         PlannedRun(f, load, float(heading), speed, 0.0, distance[f])
@@ -186,7 +190,7 @@ def steady_windows(
 
 @jax.jit
 def _sensed(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
-    """Return logged poses, currents and voltages of windows without noise."""
+    """Return what ideal sensors would log in windows: marker poses, currents and voltages."""
     p = lk.predict(robot, b)
     path = chain(jnp.zeros((b.dt.shape[0], 3)), p.increment)
     middle = 0.5 * (path[:, :1, :2] + path[:, -1:, :2])

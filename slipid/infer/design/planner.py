@@ -81,7 +81,7 @@ class Planner:
         return steady_windows(runs, self.robot, self.channels, session)
 
     def nothing(self) -> Information:
-        """Return the information of the prior without runs; marker yaws of sessions are known."""
+        """Return the information of priors only; marker yaws of single sessions count as known."""
         single = self.space.where(lambda e: e.session is not None)
         std = np.where(single, 1e-6, self.space.prior_std)
         return self._known(np.diag(std**2))
@@ -151,8 +151,8 @@ class Goal:
         name: name of the parameter or prediction.
         unit: unit of the std.
         rows: the matrix G that maps changes of the unknowns to changes of the quantity.
-        floors: floors on which runs inform directly about the goal, empty for any.
-        loads: load set-ups with which runs inform directly about the goal, empty for any.
+        floors: floors on which runs inform directly about the goal; empty if any floor does.
+        loads: load set-ups with which runs inform directly about the goal; empty if any does.
     """
 
     name: str
@@ -167,7 +167,7 @@ class Goal:
         return floor in (self.floors or {floor}) and load in (self.loads or {load})
 
     def std(self, information: Information) -> float:
-        """Return the std of the goal's quantity at this information."""
+        """Return the std of the goal's quantity, given the information about all parameters."""
         return float(np.sqrt(max(information.criterion(self.rows), 0.0)))
 
 

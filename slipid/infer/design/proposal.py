@@ -206,7 +206,7 @@ def _extrapolated(fit: Fit, runs: Sequence[PlannedRun]) -> list[str]:
             )
         other = {d.load for d in mine} - set(valid.loads)
         if other:
-            out.append(f"no fitted run on {floor} has the load {', '.join(sorted(other))}")
+            out.append(f"no fitted run on {floor} has the load set-up {', '.join(sorted(other))}")
     return out
 
 
@@ -220,8 +220,9 @@ def _saved(
 ) -> Content:
     """Return, for each grid, how many greedily chosen runs reach the criterion of the whole grid.
 
-    The grid and the greedy choice both start without data. The choice is among the candidates and
-    the grid's runs. The grids cover the fit's floors and load set-ups that inform about the goals.
+    The grid and the greedy choice both start from priors only. Runs are chosen from the candidates
+    and the grid's runs. The grids cover the fit's floors and load set-ups that inform about the
+    goals.
     """
     setups = [s for s in scope.setups if any(g.is_about(s) for g in goals)]
     setups = [s for s in setups if s in scope.driven] or setups or list(scope.setups)

@@ -94,7 +94,7 @@ class Scope:
     def driven_speeds(self) -> dict[str, tuple[float, ...]]:
         """Up to `MOST_SPEEDS` speeds of each floor's runs [m/s].
 
-        On a floor without known speeds of runs, they are half and all of the largest rim speed.
+        If no speed of a floor's runs is known, the speeds are the largest rim speed and half of it.
         """
         out = {}
         for floor, valid in self.fit.validity.items():

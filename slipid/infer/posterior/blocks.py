@@ -19,12 +19,13 @@ class LogDensity:
 
     Attributes:
         terms: function from vectors (walker, size) to the terms of the log density (walker,
-            group + 1), one per group and last the term of the shared coordinates.
+            group + 1): one per group, then the term of the shared coordinates.
         slope: function from vectors to the gradient of the sum of the terms.
         group: group of each coordinate, -1 for coordinates that groups share.
         centre: mean of the Gaussian.
         covariance: covariance of the Gaussian.
-        map: map to the coordinates u in which `terms` and `slope` are given; None for x itself.
+        map: map to the coordinates u of which `terms` and `slope` are functions; None if they are
+            functions of x.
     """
 
     terms: Callable[[Matrix], Matrix]
@@ -69,12 +70,12 @@ class Plan:
         ensembles: number of independent ensembles.
         walkers: number of walkers of each ensemble.
         block: number of steps in a block.
-        warm_up: numbers of blocks after which proposals are learnt, except for the last number,
-            which ends the warm-up: the blocks before it let the step of Hamiltonian moves adapt to
-            the last proposals.
+        warm_up: numbers of blocks after which proposals are learnt; the last number only ends the
+            warm-up, since the step of Hamiltonian moves needs some blocks to adapt to the last
+            proposals.
         most: number of blocks after which sampling ends even without convergence.
         spread: distance of the widest walker's start from the fit [std]; the first walker starts
-            at a quarter of it. Wide starts find modes away from the fit.
+            at a quarter of this distance. Wide starts find modes away from the fit.
         r_hat: upper limit of R-hat over ensembles for every coordinate.
         steps_per_tau: lower limit of steps per autocorrelation time for every coordinate.
         least_draws: lower limit of effective draws for every coordinate.
@@ -112,7 +113,8 @@ class ChainBlock:
             has_gauss, cached Gaussian) as in NumPy.
         accepted: fraction of the moves that changed a coordinate, for each ensemble.
         map: map to the coordinates of the next block.
-        angle: step of the Hamiltonian moves of every family in the next block [rad].
+        angle: step of the Hamiltonian moves in the next block, one per family of coordinates
+            (`proposals.families`) [rad].
     """
 
     number: int

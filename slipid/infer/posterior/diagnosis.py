@@ -41,7 +41,7 @@ class Diagnosis:
         steps: number of steps of every walker after the warm-up.
         converged: True if every coordinate meets the criteria of the plan.
         worst: index of the coordinate that is furthest from meeting a criterion.
-        reason: value of that criterion for this coordinate, as text.
+        reason: value of that criterion for this coordinate, as a string.
     """
 
     r_hat: Float[np.ndarray, " size"]
@@ -68,7 +68,7 @@ class Posterior:
         accepted: fraction of accepted moves, keyed by part of the posterior.
         converged: True if the chains converged and nearly all electric draws had an accepted
             proposal.
-        reason: value of the criterion that is furthest from being met, as text.
+        reason: value of the criterion that is furthest from being met, as a string.
     """
 
     fit: Fit
@@ -156,7 +156,7 @@ class Posterior:
 
 
 def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
-    """Return the convergence of chains without their warm-up; requires arviz-stats."""
+    """Return the convergence of chains whose warm-up was removed; requires arviz-stats."""
     from arviz_stats.base import array_stats
 
     ensembles, steps, walkers, size = chain.shape
@@ -183,8 +183,8 @@ def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
 def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
     """Return the integrated autocorrelation time of every coordinate [step].
 
-    Autocovariances are about the mean of all walkers, so that a walker at rest lengthens the time;
-    the window is the first with M >= 5 tau (Sokal 1996).
+    Autocovariances are relative to the mean of all walkers, so that a walker at rest lengthens the
+    time; their sum ends at the first lag M with M >= 5 tau (Sokal 1996).
     """
     steps = chain.shape[1]
     about = chain - chain.mean(axis=(0, 1, 2))

@@ -5,9 +5,9 @@ groups share, and a term of the shared coordinates. Moves are made in the coordi
 `transport_map`. A move changes either all groups in one evaluation, where each group is accepted or
 rejected by its own term, or the shared coordinates, while the mapped coordinates of groups stay
 fixed.
-Independence moves and differential evolution are efficient where the map is accurate, Hamiltonian
-moves along the gradient also where it is not; walks along single coordinates cross plateaus of the
-density.
+Independence moves and differential evolution are efficient where the map makes the density nearly
+Gaussian. Hamiltonian moves, which follow the gradient, are also efficient where it does not. Walks
+along single coordinates cross plateaus of the density.
 """
 
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ class FamilyMove(Move):
     """
 
     halves = 1
-    """Number of subsets of walkers moved in turn; 2 if a proposal uses walkers that are fixed."""
+    """Number of subsets of walkers moved in turn; 2 if a proposal uses walkers that stay fixed."""
 
     def __init__(self, family: Family):
         self.family = family
@@ -168,7 +168,7 @@ class CoordinateWalk(FamilyMove):
 
     If data only show that a parameter is small, the density of its logarithm has a plateau. No map
     makes this density Gaussian, but the walk crosses the plateau. Either all other coordinates of x
-    stay fixed, or all other coordinates of u; x then changes along with the map.
+    stay fixed, or all other coordinates of u; in the second case the map changes x.
     """
 
     def __init__(self, target: LogDensity, groups: tuple[int, ...] | None):

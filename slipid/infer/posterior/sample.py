@@ -109,8 +109,8 @@ def drawn_variances(
     """Return draws of the log variances, which stay fixed in the chains.
 
     The log variances depend little on the parameters of the model. They are drawn from a Gaussian
-    around the fit with their expected information. The variance of the load biases, of which there
-    are few, is drawn from its posterior on a grid instead.
+    around the fit with their expected information. Only the variance of the load biases is drawn
+    on a grid: its posterior is not Gaussian, since there are few biases.
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
@@ -190,7 +190,7 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
 
 
 def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
-    """Return draws, dimensions and units of every quantity with a free parameter, keyed by it."""
+    """Return draws, dimensions and units of free parameters, keyed by `Entry.quantity`."""
     shape = found.z.shape[:2]
     robots = jax.vmap(space.tree)(jnp.asarray(found.z.reshape(-1, space.size)))
     values, dims, units = {}, {}, {}

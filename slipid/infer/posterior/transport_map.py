@@ -53,10 +53,10 @@ class Warp:
     """Sinh-arcsinh map of every coordinate; skew 0 and tail 1 make it linear.
 
     Attributes:
-        place: location.
-        scale: width.
-        skew: asymmetry.
-        tail: lightness of the tails.
+        place: centre of the map, in units of v.
+        scale: width of the nearly linear range around the centre, in units of v.
+        skew: asymmetry, positive if the upper tail of v is the longer one.
+        tail: above 1 if the tails of v are lighter than those of a Gaussian.
     """
 
     place: Leaf

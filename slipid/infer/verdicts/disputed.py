@@ -37,10 +37,10 @@ _UNINFORMATIVE_STD = 1.0
 
 
 def disputes(space: Space, z: Search, covariance: Square) -> dict[tuple[str, str], float]:
-    """Return pairs of floors whose load biases differ by more than noise, the largest first.
+    """Return pairs of floors whose load biases differ by more than noise, with the difference.
 
-    The value of a pair is the number of standard errors with the same p-value. The prior of the
-    biases in `space` must have the fitted std (`Space.with_pooled`).
+    A difference is given as the number of standard errors with the same p-value, largest first. The
+    prior of the biases in `space` must have the fitted std (`Space.with_pooled`).
     """
     bias = {e.surface: space.slices[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
@@ -82,10 +82,10 @@ DOUBTFUL_RATIO, UNTRUSTED_RATIO = 1.1, 1.5
 """Ratios of the error of the model to that of the encoders above which a fit is doubtful, or not to
 be trusted."""
 SMALL_ERROR = 0.005
-"""Largest excess of the model's end-point error over the encoders', over path length, that is
-ignored."""
+"""Largest excess of the model's end-point error over that of the encoders, both divided by path
+length, that is ignored."""
 USELESS_ERROR = 0.5
-"""End-point error over path length above which a model is useless."""
+"""End-point error, divided by path length, above which a model is useless."""
 MANY_AT_BOUNDS = 3
 """Smallest number of parameters at their bounds for which a fit is not to be trusted."""
 PLAUSIBLE: Mapping[str, tuple[float, float]] = {
@@ -106,7 +106,7 @@ class EndPoints:
 
     Attributes:
         model: error of the fitted model.
-        encoders: error of encoders without slip.
+        encoders: error of the path that the encoders give if no wheel slips.
     """
 
     model: float
@@ -120,7 +120,7 @@ class Trust:
     Attributes:
         word: level of trust.
         reasons: reasons against the fit, one sentence each.
-        floors: errors, keyed by floor.
+        floors: end-point errors, keyed by floor.
         runs: number of predicted runs.
     """
 
@@ -164,7 +164,7 @@ def verdict_of_trust(
     """Return the trust in a fit, by its worst aspect: errors, convergence or parameters.
 
     Args:
-        floors: errors, keyed by floor, of held-out runs if there are any.
+        floors: end-point errors, keyed by floor; those of held-out runs, if there are any.
         converged: True if the fit converged.
         parameters: every parameter of the fit.
         runs: number of predicted runs.

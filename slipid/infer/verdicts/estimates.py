@@ -267,8 +267,8 @@ def derived(
 
     The logarithm of a quotient is a difference of two coordinates. The verdict follows from the
     ratio of the posterior std of this difference, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to
-    its prior std. With draws of a posterior, whose mean and covariance are then z and `covariance`,
-    intervals are those of the draws.
+    its prior std. If draws of a posterior are given, z and `covariance` must be their mean and
+    covariance; the intervals are then those of the draws.
     """
     pairs = [
         (over.path, under, d)

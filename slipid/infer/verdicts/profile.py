@@ -36,7 +36,7 @@ RISE = float(chi2.ppf(0.9, 1)) / 2
 """Rise of minus log likelihood, above its minimum, at the ends of the 90 % interval."""
 _COMPLETE_RISE, _LARGEST_RISE = 1.5 * RISE, 3 * RISE
 """Rise at which one side of a profile is complete, and largest rise of its last point: if the last
-point exceeds it and the point before lies within the interval, the last step is halved."""
+point exceeds this rise and the point before lies within the interval, the last step is halved."""
 _FARTHEST = 3.0
 """A side is computed up to this distance from the prior mean [prior std] or from the estimate
 [Laplace std], whichever reaches farther."""
@@ -60,7 +60,7 @@ class Profile:
         ends: kind of each side: `closed`, `open` (the likelihood does not fall to the level of the
             interval's end within the computed range) or `at_bound` (open, but the parameter's bound
             ends the interval).
-        given: what was held at the fit's values, as text; empty if all parameters were refitted.
+        given: what was held at the fit's values, in words; empty if all parameters were refitted.
         settled: True if every refit converged.
         sentence: result in one sentence for people.
     """
@@ -92,8 +92,8 @@ def profiled(space: Space, path: str) -> Entry:
     """Return the entry of the parameter `path`, which must be free and a scalar.
 
     Raises:
-        ValueError: the parameter does not exist, is fixed or a vector; the message lists valid
-            ones.
+        ValueError: the parameter does not exist, is fixed, or is a vector; the message lists the
+            free scalars.
     """
     can = {e.path: e for e in space.free if e.size == 1}
     if path not in can:
@@ -183,7 +183,7 @@ class _Refits:
         self.lowest = self.loss(optimum.state)
 
     def loss(self, state: FitState) -> float:
-        """Return minus the log posterior at fixed noise, without currents if `of_motion`."""
+        """Return minus the log posterior at fixed noise; if `of_motion`, of motion data only."""
         problem, log_v = self.problem, state.log_variance
         blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
         if self.of_motion:
@@ -195,7 +195,7 @@ class _Refits:
         return problem.loss(state.z, log_v, keep, weighed, self.electric)
 
     def side(self, sign: float) -> list[tuple[float, float]]:
-        """Return points (coordinate, loss) from the estimate outward, downward for sign -1.
+        """Return points (coordinate, loss) outward from the estimate; sign -1 means downward.
 
         A side ends where the loss without the parameter's own prior has risen by `_COMPLETE_RISE`,
         or at the distance `_FARTHEST`.

@@ -24,7 +24,7 @@ from slipid.model.robot import Validity
 from slipid.search_space import Space
 
 FLAT_INFORMATION = 1 / WEAK**2
-"""A unit direction is flat if the information along it is below this; that of the prior is 1."""
+"""Information along a unit direction below which it is flat; the prior's own information is 1."""
 TORQUE_SCALE = (
     "motor.back_emf",
     "motor.coulomb_friction",
@@ -33,7 +33,7 @@ TORQUE_SCALE = (
 )
 """Quantities that can be multiplied by a common factor without any change of the currents."""
 _NO_EFFECT = 1.02
-"""The data are uninformative about a direction if the information along it is below this.
+"""Information along a unit direction below which the data count as uninformative about it.
 
 Such directions are searched for first."""
 _NAMED_RATIO = 0.3
@@ -168,15 +168,15 @@ def _sparse(
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
     """Return a basis of the flat directions, as pairs of coordinates and a unit vector on them.
 
-    Without any one of its coordinates, a direction would no longer be flat. After each direction
-    the coordinate with its largest component (the first of equal ones) counts as known, as in
-    Gaussian elimination, so that directions are independent.
+    A direction would no longer be flat if any one of its coordinates were fixed. After each
+    direction, the coordinate with its largest component (the first of equal ones) counts as known,
+    as in Gaussian elimination, so that directions are independent.
 
     Args:
         precision: the information.
         among: indices of the coordinates that are searched.
         symmetry: indices of coordinates that a common factor may scale. The direction of this
-            scaling is tested as a whole before the search, which would only find parts of it.
+            scaling is tested as a whole first, since the search would only find parts of it.
         move: prior-scaled step of each coordinate for a common factor on all parameters.
     """
     alone = [k for k in among if precision.of([k])[0, 0] < FLAT_INFORMATION]
@@ -236,10 +236,10 @@ def _named(
 def _rounded(
     precision: _Precision, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
 ) -> np.ndarray:
-    """Return the search-space step along a direction, of length 1 in prior stds, rounded.
+    """Return the rounded search-space step along a direction; its length is 1 prior std.
 
-    The steps of the coordinates in `main` are rounded to multiples of half the largest one, which
-    makes the exponents of a formula simple. The steps stay unrounded if rounding would make one of
+    The steps of the coordinates in `main` are rounded to multiples of half the largest one, so that
+    the exponents of a formula are simple. The steps stay unrounded if rounding would make one of
     them zero, or if the rounded direction is not flat.
     """
     step = u * std

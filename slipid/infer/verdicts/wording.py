@@ -154,7 +154,7 @@ _CAMERA = (
 `_FLOOR` stands for any quantity of a floor.
 """
 FEW_HEADINGS = 4
-"""With fewer headings, the remedy proposes more; opposite headings count as two."""
+"""Number of headings below which the remedy proposes others; opposite headings count as two."""
 TURNING = 0.05
 """Yaw rate by the encoders above which a run counts as a curve [rad/s]."""
 LITTLE_SLIP = 0.03
@@ -204,7 +204,7 @@ def _electric(
 
 
 def _runs(found: Sequence[Entry], validity: Mapping[str, Validity], sideways: bool) -> str:
-    """Return a sentence on further runs for parameters of floors, loads and marker."""
+    """Return a sentence on further runs for parameters of floors, load set-ups or the marker."""
     floors = {e.surface for e in found if e.surface is not None}
     loads = {e.load for e in found if e.load is not None}
     mine = [

@@ -75,7 +75,7 @@ def base_of(floor: str) -> str:
 
 
 def facts_of(data: Runs, base_radius: float) -> list[FoldKey]:
-    """Return floor, heading and speed of all runs, by which they are split.
+    """Return floor, heading and speed of all runs, by which the runs are split.
 
     For a robot with two drives, heading and speed are the direction and the norm of the vector
     (commanded forward speed, base radius times turn rate) [m/s].
@@ -109,7 +109,7 @@ def headings(facts: Sequence[FoldKey]) -> Labels:
 
 
 def sectors(facts: Sequence[FoldKey]) -> Labels:
-    """Return folds by sector of the heading, every other sector in one; -1 without a heading."""
+    """Return folds of even and of odd sectors of the heading; -1 for runs without a heading."""
     sector = compared.sectors(facts)
     return np.where(sector < 0, sector, sector % HEADING_FOLDS)
 
@@ -154,9 +154,9 @@ def inner(runs: Sequence[Run], kind: str) -> Labels:
     The training runs are divided by the protocol's kind of split. The `INNER_FOLDS` largest parts
     are held out in turn and numbered from 0. All other runs are -1, or `INNER_FOLDS` if runs are
     assigned at random, and always remain training runs. If the training runs have fewer than two
-    parts of the kind, they are divided by headings. Sectors are always divided so: the training
-    runs are every other sector, which is one part, and if another sector were held out of them, the
-    gap would be three times as wide as in the protocol.
+    parts of the kind, they are divided by headings. This is always so if the kind is sectors: the
+    training runs are every other sector, which is one part, and if another sector were held out of
+    them, the gap would be three times as wide as in the protocol.
     """
     facts = [facts_of_run(run) for run in runs]
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):

@@ -85,7 +85,10 @@ def shown(rows: Content) -> list[str]:
 
 
 def in_words(name: str, value: Sequence[float] | None) -> str:
-    """Return a field's value as text, empty for None; see `WITH_INTERVALS` for its interval."""
+    """Return a field's value as a string, with its interval if the field is in `WITH_INTERVALS`.
+
+    The string is empty for None.
+    """
     if value is None:
         return ""
     _, factor, places = COLUMNS[name]

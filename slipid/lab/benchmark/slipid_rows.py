@@ -36,7 +36,7 @@ NAME = "slipid"
 TOLERANCE = 0.1
 """A fit has converged when no parameter changes by more than this multiple of its std.
 
-The errors of predictions vary far more than this between runs."""
+Predictions then change by far less than their errors vary between runs."""
 STEPS_MULTIPLE = 16
 """The steps of a replay are padded to a multiple of this number, so that the estimator is compiled
 for few array sizes."""

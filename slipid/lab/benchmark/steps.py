@@ -39,10 +39,11 @@ class RunBatch:
 
 
 def run_batches(data: Runs, robot: Robot, poses_per_step: int = POSES_PER_STEP) -> list[RunBatch]:
-    """Return all runs divided into steps, from one centimetre of wheel motion to the last pose.
+    """Return all runs divided into steps.
 
-    Logged poses are corrected in scale and lag by the robot's camera model. Nearly all runs get the
-    same number of steps, a power of two, so that functions are compiled for few array sizes.
+    The steps of a run begin after one centimetre of wheel motion and end at the last pose. Logged
+    poses are corrected in scale and lag by the robot's camera model. Nearly all runs get the same
+    number of steps, a power of two, so that functions are compiled for few array sizes.
     """
     poses = [int(data.fresh[data.rows(k)].sum()) for k in range(len(data))]
     usual = _step_count(float(np.quantile(poses, 0.1)), poses_per_step)

@@ -46,12 +46,12 @@ def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) ->
     """Return the method with the best of its settings, unfitted.
 
     With each setting, the method is fitted without a part of the runs and scored on that part. The
-    part is chosen by the protocol's kind of split where the training runs allow it (`inner`). The
-    score is a mean error in which all floors have equal weights: the end-point error relative to
-    the path length, or the energy error, as `SlipModel.aim` says. A setting with which the method
-    cannot be fitted has the worst score. All training runs are used, since settings that are best
-    for fewer runs are too cautious. For a method that is fitted floor by floor, one fit to all runs
-    together is also tried, with the best settings, and used if it has the smaller loss.
+    part is chosen by the protocol's kind of split where the training runs allow it (see `inner`).
+    The score is a mean error in which all floors have equal weights: the end-point error relative
+    to the path length, or the energy error if this is `SlipModel.aim`. A setting with which the
+    method cannot be fitted has the worst score. All training runs are used, since settings that are
+    best for fewer runs are too cautious. For a method that is fitted floor by floor, one fit to all
+    runs together is also tried with the best settings, and used if it has the smaller loss.
     """
     part = inner(runs, kind)
 

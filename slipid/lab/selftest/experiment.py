@@ -32,8 +32,8 @@ LEVEL = 1e-3
 """Significance level of the two tests of a parameter's errors over all replicates.
 
 The tests check whether its 90 % intervals contain the truth often enough, and whether its errors
-agree with its standard deviations. A parameter that fails one of them was recovered wrongly, unless
-it counts as not recovered anyway."""
+agree with its standard deviations. A parameter that fails one of these tests counts as recovered
+wrongly, unless its verdict already makes it count as not recovered."""
 LEAST_CONVERGED = 0.75
 """Smallest fraction of the replicates' fits that must converge for a successful self test."""
 VERDICT_ORDER = ("identified", "weak", "not_identified", "at_bound")

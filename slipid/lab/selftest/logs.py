@@ -65,7 +65,7 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
     **{f"surface.firm.{name}": firm for name, (firm, _) in _FLOORS.items()},
     **{f"surface.soft.{name}": soft for name, (_, soft) in _FLOORS.items()},
 }
-"""True parameters of the default robot in SI units, by path.
+"""True parameters of the default robot in SI units, keyed by path.
 
 They have the magnitudes found on real logs. All other parameters have their declared start
 values."""
@@ -137,8 +137,8 @@ class SimulatedSensors:
     """Noise, sampling and quantisation of simulated logs.
 
     Attributes:
-        std: std of each variance component, by its name in `slipid.fitting.noise.noise`; a name
-            with `floor` in place of a floor's name holds for every floor without an entry.
+        std: std of each variance component, keyed by its name in `slipid.fitting.noise.noise`; a
+            key with `floor` instead of a floor's name holds for every floor without an entry.
         ripple: std of the current's noise from row to row [A].
         voltage_noise: std of the voltage's noise from row to row [V].
         current_step, voltage_step: steps of the analogue-to-digital converters [A], [V].
@@ -178,7 +178,7 @@ class SimulatedSensors:
     signed: bool = False
 
     def of(self, name: str) -> float:
-        """Return the std of a variance component by its name; 0 without an entry in `std`."""
+        """Return the std of the variance component of this name; 0 if `std` has no entry for it."""
         head, _, last = name.partition(".")
         of_any_floor = f"{head}.floor.{last.split('.')[-1]}"
         return self.std.get(name, self.std.get(of_any_floor, 0.0))

@@ -56,8 +56,8 @@ def simulate_windows(
         truth: robot with the true parameters, and the floors, loads, sessions of the windows.
         w: windows that were driven; channels that they lack are not simulated.
         rng: generator of the random numbers of the noise.
-        std: std of each variance component by its name (`fit.noise`); a name without a floor holds
-            for every floor without an entry, and missing components are zero.
+        std: std of each variance component, keyed by its name (as in `fit.noise`); a key without a
+            floor holds for every floor without an entry, and missing components are zero.
     """
 
     def predicted(which: Int[np.ndarray, " segment"]) -> tuple[Array, Array, Array]:
@@ -184,10 +184,10 @@ class Replicate:
     """One simulated experiment and its fit.
 
     Attributes:
-        parameters: parameters and ratios of parameters, by path.
-        curves: slip curves by floor.
+        parameters: recovery of parameters and of ratios of parameters, keyed by path.
+        curves: recovery of the slip curve of each floor.
         predictions: mean distance between predicted and true end of a run, divided by the true
-            chord, by floor and slip model.
+            chord, keyed by floor and slip model.
         converged: True if the fit converged.
     """
 
@@ -270,7 +270,7 @@ def recovery(
 ) -> Replicate:
     """Return the comparison of a fit with its truth: parameters, ratios, curves, predictions.
 
-    `true` has the true free parameters in the search space, `end` the result of the fit.
+    `true` has the true free parameters in the search space, and `end` is the result of the fit.
     """
     space, volt = problem.space, problem.windows.has_voltage
     z, covariance = end.state.z, end.covariance

@@ -69,7 +69,7 @@ class SimulationPlan:
         content: content of the config.
         site: robot, sensors and surfaces.
         maps: maps of floors with several surfaces, keyed by name.
-        runs: name and program of each run.
+        runs: pairs of name and run.
         filmed: names of the runs that are filmed.
     """
 
@@ -193,7 +193,7 @@ def _refuse_unknown(path: Path, where: str, name: str, choices: Collection[str])
 
 @contextmanager
 def _naming(what: str) -> Iterator[None]:
-    """Context that turns a `ValueError` into a `DataError` which names this part of the config."""
+    """Return a context that turns a `ValueError` into a `DataError` beginning with `what`."""
     try:
         yield
     except DataError:

@@ -122,7 +122,10 @@ class SiteRun:
 def straight(
     surface: str, load: str, heading: float, speed: float, distance: float, turn: float = 0.0
 ) -> SiteRun:
-    """Return a run with a constant command; a straight path without slip is centred on the origin.
+    """Return a run with a constant command.
+
+    The start is placed so that the origin is the middle of the path, if it is straight and nothing
+    slips.
 
     Args:
         surface: name of the surface.
@@ -141,9 +144,9 @@ def straight(
 
 
 def named_runs(runs: Sequence[SiteRun], jitter: float, seed: int) -> list[tuple[str, SiteRun]]:
-    """Return the runs with names `<load>/<folder>/runNNN`, and randomly changed start headings.
+    """Return pairs of a name `<load>/<folder>/runNNN` and a run whose start heading is changed.
 
-    Headings change by at most `jitter` [rad], as if the robot were placed by hand.
+    Headings change at random by at most `jitter` [rad], as if the robot were placed by hand.
     """
     rng = np.random.default_rng(seed)
     counts: dict[str, int] = {}

@@ -156,7 +156,7 @@ class RobotBuild:
         mount_n_m: stiffness of a roller's mount along the wheel's rim [N/m].
         roller_friction_nm: friction torque of a roller's bearing [N m].
         wheel_mass_kg: mass of a wheel without rollers [kg].
-        body_radius_m: radius of the chassis, used in pictures only [m].
+        body_radius_m: radius of the chassis, used in videos only [m].
         marker_height_m, marker_size_m: height of the camera's marker above the floor, and its edge
             length [m].
         marker_yaw_deg: heading of the marker less that of the body [deg].
@@ -189,7 +189,10 @@ class RobotBuild:
 
     def __post_init__(self) -> None:
         if self.roller_radius_m >= self.wheel_radius_m:
-            raise ValueError("the rollers are as large as the wheel; expected smaller rollers")
+            raise ValueError(
+                f"roller_radius_m = {self.roller_radius_m} is not less than wheel_radius_m = "
+                f"{self.wheel_radius_m}; expected smaller rollers"
+            )
         if self.own_mass_kg <= 0:
             raise ValueError(
                 f"mass_kg = {self.mass_kg} is less than the mass of the wheels; expected a larger "
@@ -259,8 +262,8 @@ def mjcf(
         load: name of the load set-up, which determines the centre of mass.
         timestep: time step of the engine [s].
         ribs: x, lowest y, highest y, height of every rib on the floor [m].
-        looks: XML of lights, textures and materials for pictures.
-        floor_looks: XML attributes of the floor's plane for pictures.
+        looks: XML of lights, textures and materials for videos.
+        floor_looks: XML attributes of the floor's plane for videos.
     """
     m = robot
     # place the chassis' centre of mass so that the centre of mass of the whole robot, wheels

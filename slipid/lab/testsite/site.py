@@ -26,7 +26,7 @@ class SiteSensors:
     """Errors of the logged sensors.
 
     Attributes:
-        row_s, row_jitter: mean time between rows [s], and its largest relative deviation [1].
+        row_s, row_jitter: mean time between rows [s], and largest relative deviation from it [1].
         current_step_a, current_noise_a: quantisation step of currents, and std of their noise [A].
         current_is_signed: True if currents have a sign; most robots log magnitudes.
         speed_step, speed_gain: quantum of the reported motor speed [rad/s], and reported over true

@@ -1,7 +1,7 @@
 """Videos of runs on the test site: frames with marker, floor, perspective and lens distortion.
 
-Drawing needs OpenGL without a screen: EGL, which runs in software without a graphics card. To
-simulate runs without videos, no OpenGL is needed.
+Drawing needs OpenGL without a screen: EGL, which runs in software if there is no graphics card.
+Simulations without videos need no OpenGL.
 """
 
 import os
@@ -220,7 +220,7 @@ def _drawing_error(error: Exception) -> DataError:
 def _carpet(
     floor: FloorMap, site: Site, extent: tuple[float, float, float, float], rng: np.random.Generator
 ) -> np.ndarray:
-    """Return a picture of the floor, every surface in its colour with random grain."""
+    """Return an image of the floor, with every surface in its colour and with random grain."""
     step = 0.002
     x = np.arange(extent[0], extent[2], step) + 0.5 * step
     y = np.arange(extent[1], extent[3], step) + 0.5 * step
@@ -232,7 +232,7 @@ def _carpet(
 
 
 def _marker(cv2: ModuleType) -> np.ndarray:
-    """Return a picture of the marker; its top edge is on the right, towards the body's front."""
+    """Return an image of the marker; its top edge is on the right, towards the body's front."""
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     drawn = np.rot90(cv2.aruco.generateImageMarker(book, MARKER, 480), -1)
     return np.repeat(drawn[..., None], 3, axis=2)

@@ -42,7 +42,7 @@ class SurfacePhysics:
             default there are none.
         unevenness: std, over the floor, of the logarithm of rolling friction and shear stiffness
             [1].
-        colour: colour in pictures, as `#rrggbb`.
+        colour: colour in videos, as `#rrggbb`.
     """
 
     friction: Annotated[float, Field(gt=0, le=10)] = 0.8
@@ -70,14 +70,16 @@ SURFACES: dict[str, SurfacePhysics] = {
     "soft": SurfacePhysics(0.8, 0.0028, 0.007, 2.2e3, 3e3, 0.5, unevenness=0.15, colour="#1f6b45"),
     "ribbed": SurfacePhysics(0.6, 0.0006, 0.001, 2e4, 0.0, 0.0, 0.0012, 0.02, 0.05, "#3f4a5a"),
 }
-"""Surfaces by name: a bare floor, a short carpet, two deeper carpets, and a ribbed mat."""
+"""Built-in surfaces, keyed by name: a bare floor, three carpets of increasing depth, a ribbed mat.
+"""
 
 
 class Terrain:
     """The floor around a start, divided into kinds: a kind is a surface at a level of unevenness.
 
     Attributes:
-        kinds: surface of each kind, and the factor of its rolling friction and shear compliance.
+        kinds: for each kind, its surface, and the factor by which its rolling friction and its
+            shear compliance are multiplied.
     """
 
     def __init__(

@@ -410,7 +410,7 @@ def test_the_same_seed_drives_the_same_run():
     ("make", "match"),
     [
         (lambda: RobotBuild(rollers=7), r"rollers\s+Input should be a multiple of 2"),
-        (lambda: RobotBuild(roller_radius_m=0.05), "rollers are as large as the wheel"),
+        (lambda: RobotBuild(roller_radius_m=0.05), "roller_radius_m = 0.05 is not less than wheel"),
         (lambda: RobotBuild(mass_kg=1.0), "less than the mass of the wheels"),
         (lambda: RobotBuild(centres_m={"far": (0.2, 0.0)}), "centres_m.far: the centre of mass"),
         (

@@ -130,9 +130,10 @@ def scatter_of(runs: Sequence[FloorSignals]) -> float:
 
 
 def stiffness_of(runs: Sequence[FloorSignals]) -> Float[np.ndarray, " drive"]:
-    """Return each drive's excess over the mean current in straight motion, median over runs [A].
+    """Return the excess of each drive's current over the mean of all drives in straight motion [A].
 
-    It is zero for robots whose wheels never have equal speeds, such as one with three omni wheels.
+    It is the median over runs, and zero for robots whose wheels never have equal speeds, such as
+    one with three omni wheels.
     """
     found = []
     for run in runs:

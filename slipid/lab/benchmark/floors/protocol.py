@@ -47,9 +47,9 @@ class EvaluationSettings:
 
     Attributes:
         seconds: times from the start of a stretch after which answers are read [s].
-        folds: number of folds into which runs are dealt.
+        folds: number of folds to which runs are assigned.
         held_out: number of folds that are held out in turn; all, or fewer to save time.
-        inner: number of folds of the inner cross-validation that picks settings; with one fold,
+        inner: number of folds of the inner cross-validation that selects settings; with one fold,
             the default settings are used.
         first_s: only this much of each held-out run is used, from its start [s].
     """
@@ -62,12 +62,15 @@ class EvaluationSettings:
 
     @classmethod
     def quick(cls) -> "EvaluationSettings":
-        """Return settings for one fold, the first minute of its runs, short times, no tuning."""
+        """Return settings without tuning, for the first minute of the runs of a single fold.
+
+        Answers are evaluated only after short times.
+        """
         return cls(seconds=QUICK_SECONDS, held_out=1, inner=1, first_s=60.0)
 
 
 def folds_of(runs: Sequence[FloorSignals], count: int) -> Int[np.ndarray, " run"]:
-    """Return the fold index of every run; the runs of each floor are dealt to folds in turn."""
+    """Return the fold index of every run; the runs of each floor are assigned to folds in turn."""
     dealt: dict[str, int] = {}
     fold = []
     for run in runs:

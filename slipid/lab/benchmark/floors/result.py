@@ -48,7 +48,7 @@ ClassifierTable = Content
 - about: description of the runs.
 - runs: number of runs.
 - floors: names of the floors.
-- chance: accuracy of always naming the most common floor.
+- chance: accuracy of a classifier that always names the most common floor.
 - rows: a row for each classifier:
     - name: name of the row.
     - settings: settings picked by cross-validation in each fold, in words.
@@ -99,9 +99,10 @@ def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> Accurac
 
 
 def confusion(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:
-    """Return `table[true][named]` [%]: of the answers on a true floor, how many name each floor.
+    """Return the confusion table of the answers after `seconds` [s].
 
-    Only answers after `seconds` [s] are counted.
+    `table[true][named]` is the percentage of the answers on the floor `true` that name the floor
+    `named`.
     """
     mine = [a for a in answers if a.seconds == seconds]
     names = sorted({a.floor for a in mine} | {a.named for a in mine})

@@ -117,7 +117,7 @@ class SlipidFloorClassifier(FloorClassifier):
 
     Attributes:
         robot: robot with its maker's data, without floors.
-        zero_a: reading of its ammeters for wheels at rest [A].
+        zero_a: reading of the robot's ammeters for wheels at rest [A].
         settings: settings of the estimator.
         fitted: robot with fitted floors and motors with their ammeters; None before a fit.
         std: standard deviation of currents in each kind of motion on each floor [A].

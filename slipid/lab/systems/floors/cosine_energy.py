@@ -64,9 +64,9 @@ LEAST_SPEED = 0.02
 
 @dataclass(frozen=True)
 class CosineEnergyClassifier(FloorClassifier):
-    """Floor classifier by the energy coefficient, a series in the direction of travel.
+    """Floor classifier with a series of the energy coefficient in the direction of travel.
 
-    Residuals from the series are taken as normally distributed.
+    Residuals from the series of each floor are assumed to be normally distributed.
 
     Attributes:
         harmonics: number of harmonics.

@@ -142,7 +142,10 @@ def floors_of(runs: Sequence[FloorSignals]) -> tuple[str, ...]:
 def training_rows(
     runs: Sequence[FloorSignals], features: Callable[[FloorSignals], Features], every_s: float = 0.0
 ) -> tuple[Features, np.ndarray]:
-    """Return features and floor names of rows in which robots move, about `every_s` [s] apart."""
+    """Return features and floor names of rows in which robots move.
+
+    The rows of a run are about `every_s` [s] apart.
+    """
     found, floors = [], []
     for run in runs:
         every = max(1, round(every_s / max(float(np.median(run.dt)), 1e-3)))

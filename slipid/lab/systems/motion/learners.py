@@ -17,7 +17,7 @@ Liberties of the trees:
     - Windows are drawn at random in proportion to their weight and then have equal weights.
 
 Source: Friedman 2001, Greedy function approximation: a gradient boosting machine, Annals of
-Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn has it.
+Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn does it.
 
 Neural network. All three components of the slip ratio at once are
 

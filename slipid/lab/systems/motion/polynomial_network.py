@@ -188,7 +188,7 @@ class PairMoments:
 def _products(
     x: Float[np.ndarray, "row input"], weight: Float[np.ndarray, " row"], most: int
 ) -> Float[np.ndarray, "a b input input"]:
-    """Return sums of weight x_i^a x_j^b at [a, b, i, j] for a + b <= `most`, and NaN elsewhere."""
+    """Return sums of weight x_i^a x_j^b at [a, b, i, j]; NaN for a + b > `most`."""
     inputs = x.shape[1]
     sums = np.full((most + 1, most + 1, inputs, inputs), np.nan)
     powers = [np.ones_like(x)]

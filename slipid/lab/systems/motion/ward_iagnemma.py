@@ -43,11 +43,12 @@ Liberties:
 - Every drive carries the same load, traction acts along the drive direction only (rollers are
   free), and the inertia is m L^2 / 2.
 - Forces from currents have a scale k and an offset f, fitted by least squares, because gear losses
-  are not known, and often not even the motor. Their errors are nearly constant within a run, so
-  their noise is chosen to give the right variance of a run's mean. They correct rho directly, and
-  the twist only through rho: the steep traction law would attribute all scatter of the forces to
-  sliding, which most of it is not. If currents have no sign, all driving wheels are assumed to
-  push. Currents of wheels below 0.3 of the fastest rim speed are not used.
+  are not known, and often the constants of the motor are not known either. The errors of these
+  forces are nearly constant within a run, so their noise is chosen to give the right variance of a
+  run's mean. The forces correct rho directly, and the twist only through rho: the steep traction
+  law would attribute all scatter of the forces to sliding, which causes only a small part of it. If
+  currents have no sign, all driving wheels are assumed to push. Currents of wheels below 0.3 of the
+  fastest rim speed are not used.
 - A run starts with the twist without slip.
 - The score is the ratio itself, without waiting for 0.4 s.
 - The pose is not corrected by later measurements: the path is integrated from the filtered twists,
@@ -91,8 +92,8 @@ _BOUNDS = {
 _GRID = ((0.3, 1.0), (0.3, 6.0), (3.0, 1.0), (3.0, 6.0))
 """Start values of A and rho, as factors of the geometric middles of their bounds."""
 _PRIOR_WEIGHT = 1e-3
-"""Weight of the prior: a parameter a factor e from its middle costs as much as this relative slip
-in every window."""
+"""Weight of the prior: a parameter that differs from the middle of its bounds by a factor e adds as
+much to the loss as this relative slip in every window."""
 _MEDIAN_OF_SQUARES = 0.4549
 """Median of the square of a standard normal variable; a median of squares divided by it is a robust
 variance."""
@@ -143,7 +144,7 @@ class PosedWindows:
 
 
 def fitted_law(windows: PosedWindows, spec: RobotSpec, with_drag: bool) -> ForceLaw:
-    """Return the force law that fits the true speeds of windows best, as steady speeds.
+    """Return the force law whose steady speeds are closest to the true speeds of windows.
 
     Errors are relative to the speeds of the rolling wheels; `with_drag` also fits c.
     """

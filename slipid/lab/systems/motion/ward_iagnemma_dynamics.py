@@ -34,7 +34,7 @@ _SOLVED = 1e-7
 
 @dataclass(frozen=True)
 class ForceLaw:
-    """Coefficients of the forces between wheels and floor, which are in proportion to the weight.
+    """Coefficients of the forces between wheels and floor, relative to the robot's weight.
 
     Attributes:
         grip: C1, traction coefficient of a wheel that slides fast [1].
@@ -123,7 +123,8 @@ class Dynamics:
     ) -> Acceleration:
         """Return accelerations at speeds q.
 
-        With `secant`, the slope of each force is that of the chord from its zero, not the tangent.
+        With `secant`, the slope of each force is that of its chord through zero, instead of that of
+        its tangent.
         """
         law, slide = self.law, rim - q @ self.rims.T
         traction, stiff = self.traction(slide), self.stiffness(slide)
