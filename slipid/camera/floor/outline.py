@@ -168,7 +168,7 @@ def _fitted(
         else:
             feet = [on + d * float((out[k] - on) @ d) for on, d in lines[k - 1 : k + 1]]
             meet = (feet[0] + feet[1]) / 2
-        # allow half a step more than the tolerance, since the middles of steps cut corners off
+        # limit the move to the tolerance plus half a step, since the middles of steps cut corners
         if np.linalg.norm(meet - out[k]) <= tolerance + 0.5:
             out[k] = meet
     return out

@@ -115,7 +115,7 @@ class Variable:
 
     @property
     def memory(self) -> Memory:
-        """Stack array with one number per lane, from which blocks other than `home` read it."""
+        """Stack array with a number per lane; blocks other than `home` read the variable there."""
         return Memory(f"m{self.number}", self.kind, self.lanes, self.home, lanes=True)
 
 
