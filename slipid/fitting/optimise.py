@@ -299,7 +299,8 @@ def levenberg(
     steps would look like convergence.
 
     The loop is not compiled: it takes little time compared with the Jacobians, while its
-    compilation would take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for the constants.
+    compilation would take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for
+    the constants.
 
     Args:
         linearised: function that returns the residuals at a vector, given twists near its own.
