@@ -70,7 +70,7 @@ def optimise(
     free: np.ndarray | None = None,
     variances: bool = True,
 ) -> Optimum:
-    """Return the maximum a posteriori, from a staged start or continued from a state.
+    """Return the maximum a posteriori, searched from `staged_start` or from a given state.
 
     Args:
         keep: 1 for segments that are fitted, 0 for held-out ones, in the order of
@@ -99,7 +99,7 @@ def optimise(
     covariance = problem.laplace(state.z, state.log_variance, keep)
     reason = f"{most_rounds} rounds without convergence"
     if settled := state.moved < tolerance:
-        reason = f"no number changed by {100 * tolerance:g} % of its std in round {state.round}"
+        reason = f"no parameter changed by {100 * tolerance:g} % of its std in round {state.round}"
     return Optimum(state, covariance, settled, reason, tuple(history))
 
 
@@ -140,7 +140,8 @@ def one_round(
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force, near = linear(objective, jnp.asarray(z), electric, near)
     effect = effects_given(weighed.effects, root["motion"], whole["motion"])
-    # Weights and effects depend on each other, and full steps of both could oscillate forever.
+    # Weights and effects depend on each other: full steps of both could oscillate forever, so the
+    # effects change by half a step.
     effect = 0.5 * (effect + before) if state.round else effect
     residual = without_effects(objective, whole, effect)
     voltage = problem.voltage_information(z, log_v, motor_force)
@@ -249,7 +250,7 @@ class RoundInputs(eqx.Module):
         prior_std: prior std of every coordinate.
         electric: noise that predictions of voltages depend on.
         motor_force: motor forces at z [mu m g], from which currents and voltages are predicted.
-        slope: derivative of log |d residuals / d data| by the search vector.
+        slope: derivative of log |d residuals / d data| with respect to the search vector.
     """
 
     objective: Objective
@@ -291,8 +292,9 @@ def levenberg(
     steps do not count: each makes the next one smaller, so that a round that stopped after refused
     steps would look like convergence.
 
-    The loop is not compiled: it takes no time beside the Jacobians, while its compilation would
-    take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for the constants.
+    The loop is not compiled: it takes little time compared with the Jacobians, while its
+    compilation would take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for
+    the constants.
 
     Args:
         linearised: function that returns the residuals at a vector, given twists near its own.

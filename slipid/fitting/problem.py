@@ -46,7 +46,7 @@ from slipid.search_space import HELD, Choice, Space
 CREEPS = (0.05, 0.4, 1.0)
 """Start values of the creep (slip ratio of full traction) of every floor.
 
-From other values, fits have ended in poor local minima.
+Fits from other start values have ended in poor local minima.
 """
 _NEAR_ZERO = 1e-4
 """Value of a viscous term that cannot be determined."""
@@ -68,7 +68,7 @@ class FitState:
         loss: minus log posterior up to a constant.
         moved: largest change in the last round: of a number in posterior stds, or a third of the
             change of a log variance.
-        stage: current stage of the fit, as text for progress reports.
+        stage: current stage of the fit, as a string for progress reports.
         effect: mean shared effects along, across [m/m] and in yaw [rad/m]; None before the first
             estimate.
     """
@@ -82,12 +82,12 @@ class FitState:
     effect: Float[np.ndarray, "segment 3"] | None = None
 
     def shared(self, segments: int) -> Float[np.ndarray, "segment 3"]:
-        """Return the shared effects of that many segments, zero before any were estimated."""
+        """Return the shared effects of `segments` segments; zero before the first estimate."""
         return np.zeros((segments, 3)) if self.effect is None else self.effect
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """Values that a checkpoint stores, by name."""
+        """Values that a checkpoint stores, keyed by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
@@ -106,7 +106,8 @@ class Problem:
     overrule forces that motion determines to 1 %.
 
     The argument `keep` of the methods is 1 for segments that are used and 0 for others. `compiled`
-    holds functions that other modules compiled for windows of these shapes, under their own keys.
+    holds functions that other modules have compiled for windows of these shapes; each module
+    chooses keys that no other module uses.
     """
 
     def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
@@ -129,10 +130,10 @@ class Problem:
         return other
 
     def holding(self, fixed: Sequence[Choice], choices: Sequence[Choice]) -> "Problem":
-        """Return the same problem with some parameters fixed, unless `choices` say otherwise.
+        """Return the same problem with some parameters fixed, unless `choices` override this.
 
-        Their priors are so narrow that they cannot move. The search vector keeps its coordinates,
-        so that nothing is compiled anew.
+        The priors of these parameters are so narrow that their values cannot change. The search
+        vector keeps its coordinates, so that nothing is compiled anew.
         """
         narrow = [
             Choice(c.pattern, start=c.fixed, prior_mean=c.fixed, prior_std=HELD * c.fixed)
@@ -213,7 +214,7 @@ class Problem:
     ) -> Float[np.ndarray, "free free"]:
         """Return the covariance of the search vector: inverse information, prior included.
 
-        With `alone`, every run is treated as if it shared no effects with others.
+        If `alone`, every run is treated as if it shared no effects with others.
         """
         jacobian = self.linear(z, self.electric(z, log_v))[1]
         information = variances.precision(self.objective, jacobian, log_v, keep, alone)
@@ -252,7 +253,7 @@ class Problem:
     def voltage_information(
         self, z: Vector, log_v: Vector, motor_force: Array
     ) -> VoltageInformation | None:
-        """Return the information of voltages about variances, None if none are logged."""
+        """Return what voltages tell about variances; None if no voltages are logged."""
         if "voltage" not in self.noise.blocks:
             return None
         return voltage_information(self.objective, z, log_v, motor_force)
@@ -473,8 +474,8 @@ def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
 def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
     """Return choices that fix the viscous terms near zero on floors driven at one speed only.
 
-    At one speed they cannot be distinguished from creep, and a wrong division between the two makes
-    wrong predictions at every other speed.
+    At one speed, viscous terms cannot be distinguished from creep, and a wrong division between the
+    two makes wrong predictions at every other speed.
     """
     driven: dict[str, list[float]] = {}
     for k in range(len(data)) if runs is None else runs:

@@ -6,9 +6,9 @@ squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with y from `slipid.fitting.shared_effects.marginal_residuals`, and f the ratio of a Student t's
-information about its centre to a Gaussian's, which the weights in y contain, too. Floors share some
-coordinates and have others of their own, so that the log posterior is a sum
+with y from `slipid.fitting.shared_effects.marginal_residuals`. The factor f is the ratio of a
+Student t's information about its centre to a Gaussian's; the weights in y contain it, too. Floors
+share some coordinates and have others of their own, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
 
@@ -79,7 +79,7 @@ class Density:
         self.structure, self.group = coordinates(problem, fitted, part)
         self.names = tuple(problem.space.names[k] for k in self.structure)
         self.anchor = Anchor.at(problem, fitted)
-        # the first density with these coordinates compiles the functions for all others
+        # The first density with these coordinates compiles the functions for all later ones.
         form = part, self.names, self.group.tobytes()
         self._each: dict[Callable[..., object], Callable[..., Any]] = {}
         self._form: Density = problem.compiled.setdefault(form, self)
@@ -98,7 +98,7 @@ class Density:
         """Return the results of a function of (density, anchor, element) for many elements.
 
         `many` are the arrays of the elements, or None, one for each further argument of the
-        function. It is compiled once for all densities with the same coordinates.
+        function. The function is compiled once for all densities with the same coordinates.
         """
         form = self._form
         if of not in form._each:
@@ -205,7 +205,7 @@ class Density:
         out = {"motion": lk.motion_residual(robot, b, p)}
         if self.part == EVERYTHING:
             out |= lk.electric_residuals(robot, b, p.motor_force, anchor.noise(robot))
-        # without the barrier XLA repeats the root finder for every use of the residuals
+        # Without the barrier, XLA would repeat the root finder for every use of the residuals.
         return _Residuals(jax.lax.optimization_barrier(out), robot)
 
     def hold(self, x: Float[np.ndarray, "walker size"]) -> HeldMotion:
