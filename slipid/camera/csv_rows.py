@@ -9,7 +9,7 @@ from slipid.support.errors import DataError
 def csv_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
     """Return each row of a CSV file as its line number and its cells; `#` lines are omitted.
 
-    Cells are separated by commas, semicolons or tabs, whichever the first row has most of.
+    Cells are separated by commas, semicolons or tabs, whichever is most frequent in the first row.
 
     Args:
         path: the file.

@@ -43,7 +43,7 @@ def _opencv() -> ModuleType:
     if not hasattr(getattr(cv2, "aruco", None), "CharucoDetector"):
         raise DataError(
             f"OpenCV {cv2.__version__} has no marker detector; expected version 4.8 or newer of "
-            "opencv-contrib-python-headless, and no other build of OpenCV beside it"
+            "opencv-contrib-python-headless, and no other installed build of OpenCV"
         )
     log = getattr(getattr(cv2, "utils", None), "logging", None)
     if log is not None:
@@ -100,7 +100,7 @@ def visible_markers(pictures: Sequence[np.ndarray]) -> tuple[str, list[int]]:
         ids = [detector.detectMarkers(np.ascontiguousarray(one))[1] for one in pictures if one.size]
         numbers[name] = {int(n) for one in ids if one is not None for n in np.ravel(one)}
     # a large dictionary contains the markers of smaller ones and detects a few more by chance, so
-    # the largest number of detections alone would favour it
+    # do not simply choose the dictionary with the most detections
     most = max(map(len, numbers.values()))
     best = min((n for n in numbers if len(numbers[n]) >= NEARLY_MOST * most), key=marker_count)
     return best, sorted(numbers[best])

@@ -24,9 +24,9 @@ class ControllerRow:
     """A combination of estimator and controller.
 
     Attributes:
-        observer: estimator: `encoder` (odometry without slip), `curve` (odometry with slip by
-            current, wheel by wheel) or `contact` (`slipid.Estimator`).
-        about: description for people.
+        observer: estimator: `encoder` (odometry without slip), `curve` (odometry with each wheel's
+            slip computed from its current) or `contact` (`slipid.Estimator`).
+        about: description for people, in the output of `slipid trial`.
         correction: torque correction of the 2021 paper, see `slipid.robot.controller.Controller`.
         law: function from a robot to a published control law that replaces the pose loop; None for
             the pose loop.
@@ -55,11 +55,15 @@ class ControllerRow:
 CONTROLLERS: Mapping[str, ControllerRow] = {
     "encoder": ControllerRow("encoder", "odometry from encoders, without slip"),
     "slip_odometry": ControllerRow("curve", "odometry corrected by slip over current (figure 5)"),
-    "paper_print": ControllerRow("curve", "and torque correction as printed", "paper_print"),
-    "paper_code": ControllerRow(
-        "curve", "and torque correction as in the authors' program", "paper_code"
+    "paper_print": ControllerRow(
+        "curve", "slip odometry and the torque correction as printed", "paper_print"
     ),
-    "torque": ControllerRow("curve", "and torque correction, corrected", "torque"),
+    "paper_code": ControllerRow(
+        "curve", "slip odometry and the torque correction as in the authors' program", "paper_code"
+    ),
+    "torque": ControllerRow(
+        "curve", "slip odometry and the torque correction without its two errors", "torque"
+    ),
     "contact": ControllerRow(
         "contact", "contact estimator, with tuned gains if they are better", tuned=True
     ),
@@ -70,6 +74,7 @@ CONTROLLERS: Mapping[str, ControllerRow] = {
         "contact", "contact estimator with a gyro", tuned=True, gyro=True
     ),
 }
+"""Combinations of estimator and controller, keyed by the name that users give."""
 
 
 def control_loop_of(
@@ -81,8 +86,8 @@ def control_loop_of(
 ) -> ControlLoop[eqx.Module]:
     """Return the control loop of a row for a robot.
 
-    If `row.tuned`, tuned gains are used if they are better than the gains set by hand, or if
-    `forced`. `floor` is used only if `row.mapped`.
+    Tuned gains are used only if `row.tuned` is True, and only if they are better than the gains set
+    by hand or `forced` is True. `floor` is used only if `row.mapped` is True.
 
     Raises:
         DataError: the row does not apply to the robot's wheels.

@@ -43,7 +43,7 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
     """Return the robot of a fit or of its posterior, with its first load set-up.
 
     Parameters are as in `identified.json`: from the posterior if one is given, else from the fit's
-    Laplace approximation. `DeployedRobot.record.source` is the method.
+    Laplace approximation. `DeployedRobot.record.source` tells which.
     """
     source: Source
     if isinstance(found, Posterior):
@@ -64,7 +64,8 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
         fit.current_trend,
         fit.validity,
     )
-    # a robot that was fitted to runs over several floors is expected to drive across edges
+    # a robot that was fitted to runs over several floors is expected to drive across edges, so use
+    # the smaller penalty for several floors under it
     alike = record.alike if fit.mixed is None else MIXED_FLOORS_PENALTY
     return DeployedRobot.of(
         replace(
@@ -172,7 +173,7 @@ def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
 
 
 def _number(e: Estimate) -> RecordedNumber:
-    """Convert an estimate of identified.json to a number of robot.json."""
+    """Convert an estimate of identified.json to a parameter of robot.json."""
     values = {f.name: getattr(e, f.name) for f in fields(RecordedNumber)}
     return typed(RecordedNumber, json.loads(json.dumps(values)), e.path)
 

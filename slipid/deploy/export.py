@@ -37,6 +37,7 @@ from slipid.support.errors import DataError, did_you_mean
 from slipid.support.progress import Reporter
 
 FORMS = ("c", "ros2", "stablehlo", "table")
+"""Forms of a robot that can be exported, see `slipid.exports.description.ABOUT`."""
 
 
 @dataclass(frozen=True)

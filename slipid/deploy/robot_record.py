@@ -141,10 +141,11 @@ def _turns(frame: WheelFrame) -> Float[np.ndarray, "twist 3"]:
 def _operating_points(
     robot: Robot, load: int, top: float, twists: Float[np.ndarray, "twist 3"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return wheel speeds [rad/s], currents [A] and slip ratios [1] at given twists on every floor.
+    """Return wheel speeds [rad/s], currents [A] and slip ratios [1] in steady states.
 
-    Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has a row
-    for every floor, speed and twist, and a column for every drive.
+    The wheel speeds are those that without slip give each twist, scaled so that the fastest wheel
+    turns at 0.4 and at 0.8 of the highest wheel speed `top` [rad/s]. Each result has a row for
+    every floor, speed and twist, and a column for every drive.
     """
     frame = robot.geometry.frame()
     forward, radius = np.asarray(frame.forward()), float(frame.radius)

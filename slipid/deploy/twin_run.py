@@ -13,6 +13,7 @@ from slipid.robot.twin import ActuatorModel, Twin, TwinPlant
 from slipid.support.errors import DataError
 
 SITE_SEED, STARTS_SEED = 7, 2021
+"""Seeds of the site's patches, and of the start poses."""
 REST_S = 1.0
 """Rest before the robot drives, during which the estimator finds the gyro's bias [s]."""
 
@@ -62,7 +63,7 @@ def require_known_surfaces(floor: FloorMap, robot: DeployedRobot, path: str) -> 
     if absent := [name for name in floor.surfaces if name not in robot.labels]:
         known = ", ".join(robot.labels)
         raise DataError(
-            f"{path}: surface '{absent[0]}' was not identified; expected only surfaces out of "
+            f"{path}: surface '{absent[0]}' was not identified; expected only these surfaces: "
             f"{known}"
         )
 

@@ -23,11 +23,13 @@ VERDICTS: Mapping[Verdict, str] = {
     "was held fixed, may be wrong",
     "fixed": "it was given by the user instead of fitted",
 }
+"""Meaning of each verdict, as text for people."""
 PROVENANCES: Mapping[Provenance, str] = {
     "measured": "the logs",
     "borrowed": "a prior: a default or a data sheet",
     "override": "a value chosen by the user",
 }
+"""Meaning of each provenance, as text for people."""
 WARNINGS: Mapping[Verdict, str] = {
     "not_identified": "NOT IDENTIFIED (their values are assumptions, not measurements)",
     "at_bound": "AT A BOUND (the model, or a parameter that was held fixed, may be wrong)",
@@ -42,7 +44,7 @@ class NumberRow:
 
     Attributes:
         group: key of the table to which the row belongs.
-        name: name of the number; its path if it is in robot.json.
+        name: name of the number; for a parameter, its path in robot.json.
         entry: wheel to which the number belongs, such as "wheel 2"; empty for a number of the whole
             robot.
         symbol: symbol in equations.
@@ -126,6 +128,7 @@ SOURCES: Mapping[Source, str] = {
     "posterior": "the posterior of a fit to logs",
     "given": "values given without logs",
 }
+"""Meaning of each `RobotRecord.source`, as text for people."""
 
 
 def header(robot: DeployedRobot) -> list[str]:
@@ -196,6 +199,7 @@ ABOUT: Mapping[str, str] = {
     "its results",
     "table": "gains, limits, matrices and parameters as tables, for entering them by hand",
 }
+"""Description of each exported form, for README.md."""
 
 
 def readme(robot: DeployedRobot, forms: Sequence[str], controller: str) -> str:

@@ -15,6 +15,7 @@ from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
 
 SUMS = "SHA256SUMS"
+"""Name of the file of checksums in an exported folder."""
 BUILD = "build"
 
 
@@ -55,7 +56,7 @@ def check_writable(folder: Path) -> None:
     sums = _sums(folder) if (folder / SUMS).is_file() else {}
     for name in sorted(_files(folder) - {SUMS}):
         if _name_of_temporary(name) in {SUMS, *sums}:
-            # accept a temporary file that an interrupted export left; it is removed
+            # an interrupted export left this temporary file: `write_folder` removes it
             continue
         if name not in sums:
             raise DataError(

@@ -16,6 +16,7 @@ from slipid.robot.controller import ControllerState
 from slipid.robot.interface import Measurement, Readings, StateEstimate
 
 GOLDEN_STEPS = 48
+"""Number of reference steps; each sensor has readings in some of these steps, see `_inputs`."""
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,8 @@ def load_program(folder: Path | str) -> Program:
     """Return the step in a folder, after checking that it reproduces the reference steps.
 
     Raises:
-        DataError: a file is absent, damaged or of another version, or the results differ.
+        DataError: a file is absent, damaged or of another version, or results differ from the
+            reference steps.
     """
     place = Path(folder)
     content = {}

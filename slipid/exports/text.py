@@ -25,7 +25,7 @@ def short(value: float) -> str:
 
 
 def interval(ends: tuple[float, float] | None) -> str:
-    """Return an interval as text, rounded to four digits; empty text for None."""
+    """Return an interval as text, rounded to four digits; an empty string for None."""
     return "" if ends is None else f"{short(ends[0])} to {short(ends[1])}"
 
 
@@ -42,7 +42,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def template(name: str) -> str:
-    """Return the text of a template of `slipid/exports/templates`, such as `c99/README.md`."""
+    """Return the text of a template in `slipid/exports/templates`, such as `c99/README.md`."""
     return (files(__package__) / "templates" / name).read_text()
 
 

@@ -141,7 +141,7 @@ share the code."""
 def run_closed_loop(
     loop: ControlLoop[State], path: Path, plant: Plant, start: Pose
 ) -> ClosedLoopRun:
-    """Run a control loop on a plant until the path ends, the controller gives up or time is over.
+    """Run a control loop on a plant until the path ends, the controller gives up, or time is up.
 
     The plant is reset first and so starts at rest. For the time limit see `DURATION_FACTOR`.
 

@@ -16,6 +16,9 @@ on the spot and driving, with growing effort. This helps a robot that is far fro
 because the demands to drive and to turn cancel at the wheels with traction, so that only a wheel
 without traction spins. The controller returns to normal operation once the robot has moved for a
 while. Otherwise it stops for good and reports that it gave up.
+
+The "2021 paper" here and in other modules is Belyaev, Brylev and Ivanov (2021), see
+docs/results.md.
 """
 
 from collections.abc import Callable
@@ -35,8 +38,8 @@ Correction = Literal["none", "torque", "paper_print", "paper_code"]
 Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
 """Function from a reference (see `Path.at`) and a pose to a body twist [m/s, m/s, rad/s]."""
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
-"""Gain of the 2021 paper's torque correction for each of the robot's three wheels, by the body axis
-along which the robot mainly drives [motor rpm per N m at the motor shaft]."""
+"""Gain of the 2021 paper's torque correction for each of the robot's three wheels, keyed by the
+body axis along which the robot mainly drives [motor rpm per N m at the motor shaft]."""
 OBSERVER_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LARGEST_INTEGRAL = 0.06
@@ -71,10 +74,10 @@ class Gains(eqx.Module):
 
     @classmethod
     def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
-        """Return a robot's tuned gains if they are better than the gains set by hand.
+        """Return a robot's tuned gains, or the gains set by hand.
 
-        With `forced`, tuned gains are returned even if they are no better. Otherwise, and also if
-        there are no tuned gains for the robot's load set-up, the gains set by hand are returned.
+        Tuned gains are returned if they are better than the gains set by hand, or if `forced` is
+        True. Without tuned gains for the robot's load set-up, the gains set by hand are returned.
 
         Raises:
             ValueError: the robot consists of arrays without a record.

@@ -233,7 +233,8 @@ class Odometry(AbstractEstimator[OdometryState]):
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
         known = jnp.isfinite(z.current) & (jnp.abs(z.current) < 10.0 * f.highest[1])
-        # the current filter of the 2021 paper's robot kept 0.97 per row: a time constant of 0.6 s
+        # use the current filter of the 2021 paper's robot, whose factor of 0.97 per row of its logs
+        # is a time constant of 0.6 s
         a = 1 - jnp.exp(-dt / 0.6)
         smoothed = old.current + a * (jnp.abs(z.current) - old.current)
         amps = jnp.where(known, smoothed, old.current)

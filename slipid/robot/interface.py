@@ -17,6 +17,7 @@ Numbers = Array | np.ndarray
 Pose = Float[Numbers, "3"] | tuple[float, float, float]
 """Pose as x, y [m] and heading [rad]."""
 Given = Numbers | Sequence[float] | float | None
+"""A reading as users give it; None if there is no reading."""
 NO_FLOOR = "unknown"
 """Name used for the floor under a wheel if no identified floor explains the measurements."""
 MIXED_FLOORS_PENALTY = 1.0

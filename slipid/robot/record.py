@@ -49,6 +49,7 @@ UNITS = {
     "highest_speed": "rad/s",
     "gains.loss": "mm",
 }
+"""Units of the fields of robot.json, keyed by the field's path without indices."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ class LoadRecord:
 
     Attributes:
         name: name of the load set-up.
-        spread: std of the motion per metre on every floor that is due to uncertain parameters.
+        spread: for each floor, std of the motion per metre that is due to uncertain parameters.
         told: effect table of this load set-up; None if the robot was not fitted to runs.
         highest_current: largest current that the model predicts at up to 0.8 of the highest wheel
             speed.

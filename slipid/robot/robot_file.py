@@ -27,7 +27,7 @@ from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
 _MOST = sys.float_info.max
-_PLAIN = {bool: "true or false", str: "text", int: "a whole number", NoneType: "null"}
+_PLAIN = {bool: "true or false", str: "a string", int: "a whole number", NoneType: "null"}
 
 
 def typed(kind: Any, value: object, where: str = "") -> Any:
@@ -99,7 +99,8 @@ def _object(kind: Any, value: object, where: str) -> Any:
             raise ValueError(f"the field {before}{name} is missing")
     for name in value:
         if name not in names:
-            raise ValueError(f"{before}{name}: no such field; expected {', '.join(names)}")
+            known = ", ".join(names)
+            raise ValueError(f"{before}{name}: no such field; expected only these fields: {known}")
     return kind(**{name: typed(hints[name], value[name], f"{before}{name}") for name in names})
 
 
@@ -209,7 +210,7 @@ def check_record(record: RobotRecord) -> None:
         raise ValueError("wheels.place: no entries; expected one entry for every wheel")
     for name in ("drive_angle", "roller_angle", "grips"):
         _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
-    # Geometry itself raises ValueError for wheels that cannot drive, or without a drive
+    # geometry_of raises ValueError for wheels that cannot drive, or that have no drive
     drives = geometry_of(record).drives
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):

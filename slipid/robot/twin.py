@@ -109,7 +109,7 @@ class TwinState(eqx.Module):
         wanted: set-point speeds of the wheels' speed control [rad/s].
         speed: wheel speeds [rad/s].
         angle: wheel angles [rad].
-        effect: present effect of every floor beyond its estimate, in units of its remaining std.
+        effect: present effect of every floor less its estimate, in units of the remaining std.
         toward: settled direction of travel, see `slipid.robot.filter.effects`.
         offset: error of the modelled currents that is constant in a run [A].
         drift: error of the modelled currents that is correlated over time [A].
@@ -152,12 +152,12 @@ class Twin(eqx.Module):
             )
 
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
-        """Return the standard normal random numbers of step `number`, which is 0 for `first`."""
+        """Return the standard normal random numbers of a step; `number` is 0 for `first`."""
         count = 3 * (self.robot.wheels + self.actuators.substeps + len(self.robot.labels)) + 1
         return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
     def init(self, pose: Pose, key: Array) -> TwinState:
-        """Return the state at rest at a pose [m, m, rad], with this run's errors drawn by `key`."""
+        """Return the state at rest at a pose [m, m, rad]; `key` draws the errors of this run."""
         f, w = self.robot, (self.robot.wheels,)
         one, two, three = jax.random.split(jax.random.fold_in(key, 2**31 - 1), 3)
         off = jax.random.normal(two, w) * jnp.mean(f.current_std) / jnp.sqrt(2.0)

@@ -181,14 +181,15 @@ class View:
             return True
         steps = np.unique(np.round(np.diff(np.unique(self.board_m)), 9))
         spread = np.linalg.svd(self.board_m - self.board_m.mean(0), compute_uv=False)
+        # with half of the corners on each of two neighbouring lines, the factor would be 0.5
         return bool(spread[1] < 0.4 * steps[steps > 0].min() * np.sqrt(len(self.pixels)))
 
 
 def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legacy: bool) -> Board:
-    """Return a board whose size is given as text such as `7x5`: columns and rows of squares.
+    """Return a board whose size is given as a string such as `7x5`: columns x rows of squares.
 
     Raises:
-        DataError: the text does not have this form, or no board can have these sizes.
+        DataError: the string does not have this form, or no board can have these sizes.
     """
     columns, by, rows = size.lower().partition("x")
     if not (by and columns.strip().isdecimal() and rows.strip().isdecimal()):
@@ -197,7 +198,7 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
 
 
 def view_of(board: Board, picture: Picture) -> View:
-    """Return the corners of the board in an image; the view is empty if it is not detected."""
+    """Return the corners of the board in an image; an empty view if the board is not detected."""
     detector = cv2.aruco.CharucoDetector(board.pattern)
     pixels, numbers = detector.detectBoard(picture.image)[:2]
     if numbers is None:
@@ -272,7 +273,7 @@ def _difference(view: View, other: View) -> float:
 
 
 def not_detected(board: Board, pictures: Sequence[Picture]) -> DataError:
-    """Return the error to raise if no image shows the board; its message says what images show."""
+    """Return the error to raise if no image shows the board, with advice by `_advice`."""
     if len(pictures) == 1:
         where = f"{pictures[0].path}: the board is not found in it"
     else:
@@ -307,7 +308,7 @@ def _advice(board: Board, pictures: Sequence[Picture]) -> str:
 def _other_board(board: Board, dictionary: str, pictures: Sequence[Picture]) -> str | None:
     """Return advice if images show a similar board with this dictionary's markers, else None.
 
-    A similar board may have rows and columns swapped, the other legacy pattern, or both.
+    A similar board may have rows and columns swapped, the other value of `legacy`, or both.
     """
     if marker_count(dictionary) < board.columns * board.rows // 2:
         return None

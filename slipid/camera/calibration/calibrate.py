@@ -96,7 +96,7 @@ def _covariance(lens: Content, count: int) -> Float[np.ndarray, "parameter param
 
 
 def on_board(lens: CalibratedLens, board: Board, picture: Path, height_m: float) -> FloorPoints:
-    """Return the corners of a board that lies on the floor, as points of world and image.
+    """Return the corners of a board that lies on the floor, with world positions and pixels.
 
     Args:
         lens: the camera's lens.
@@ -149,7 +149,7 @@ def floor_from_points(lens: CalibratedLens, path: Path, size_std: float) -> Floo
 def straight_camera(
     picture: Path, metres_per_pixel: float, height_m: float, turn_deg: float, size_std: float | None
 ) -> OverheadCamera:
-    """Return an uncalibrated camera that looks straight down, with the size of a given image.
+    """Return an uncalibrated camera that looks straight down, with the image size of `picture`.
 
     `size_std` is the relative std of lengths on the floor [1], None if it is not known. The other
     arguments are those of `OverheadCamera.straight_down`.

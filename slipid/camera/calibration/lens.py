@@ -17,8 +17,11 @@ from slipid.support.errors import DataError
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Parameters of a lens, in the order of its covariance; k3 is present only if it is fitted."""
 MOST_ROUNDS = 30
+"""Largest number of fits in `fit_robustly`; after each fit but the last, views or corners are
+excluded."""
 VIEW_RATIO = 3.0
-"""Ratio of a view's median residual to that of all views above which the view is excluded [1]."""
+"""Ratio of a view's median residual to the median of these over all views, above which the view is
+excluded [1]."""
 CORNER_RATIO = 6.0
 """Ratio of a corner's residual to the median residual above which the corner is excluded [1]. Pure
 noise exceeds it for one corner in 10^7."""
@@ -35,7 +38,7 @@ class Pose:
 
     Attributes:
         turn: rotation vector [rad].
-        shift: origin of the object's axes in the camera's [m].
+        shift: position of the object's origin in the camera's axes [m].
     """
 
     turn: Float[np.ndarray, "3"]
@@ -53,8 +56,10 @@ class Projection:
 
     Attributes:
         pixels: u, v of each point [pixel].
-        by_pose: derivatives with respect to the pose's turn [pixel/rad] and shift [pixel/m].
-        by_lens: derivatives with respect to the lens's parameters, in the order of NAMES.
+        by_pose: derivatives of u and v, point by point, with respect to the pose's turn [pixel/rad]
+            and shift [pixel/m].
+        by_lens: derivatives of u and v, point by point, with respect to the lens's parameters, in
+            the order of NAMES.
     """
 
     pixels: Float[np.ndarray, "point 2"]
@@ -220,7 +225,7 @@ def fit_robustly(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> 
                 )
             check_enough(now)
             continue
-        # exclude only the worst corner of each view: it may distort the residuals of the others
+        # exclude only the worst corner of each view: it may distort the other residuals
         limit = max(CORNER_RATIO * level, HARMLESS_PX)
         bad = [(one > limit) & (one == one.max()) for one in off]
         if not any(b.any() for b in bad):

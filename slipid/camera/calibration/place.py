@@ -13,11 +13,15 @@ from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.support.errors import DataError
 
 FLAT_M = 1e-9
+"""Range of the points' heights below which the points count as lying in a plane [m]."""
 AGREEMENT = 0.3
 """Ratio of the fit's error without a point to its error with all points, below which that point
 counts as bad [1]."""
 LEAST_BAD_PX = 1.5
+"""Error of a point, or root mean square error of a fit, up to which no point counts as bad
+[pixel]."""
 LEAST_TO_DROP = 6
+"""Number of points below which a bad point is reported but not excluded."""
 LEAST_TO_TEST = 5
 """Number of points below which the fit cannot show which point is bad."""
 MOST_POINTS_EXCLUDED = 0.25
@@ -31,6 +35,7 @@ be smaller than the accuracy of a detected corner."""
 STEP_IN_STDS = 0.01
 """Step of numerical derivatives, in stds of the variable [1]."""
 GRID_POINTS = 5
+"""Number of grid pixels across and down the image, between which lengths are compared."""
 INNER_SHARE = 0.8
 """Fraction of the image's width and height in which lengths on the floor are compared [1]."""
 
@@ -43,8 +48,8 @@ class FloorFit:
         camera: the lens at its fitted pose.
         pose: pose of the world in the camera's axes.
         points: points that the pose was fitted to.
-        twin_px: root mean square error of the next best pose that also looks down [pixel]; None if
-            there is none.
+        twin_px: root mean square error of the next best camera pose that is also above the floor
+            and looks down, with another rotation [pixel]; None if there is none.
         left_out: sentences about points that contradict the others.
         disputed: True if the points contradict each other, but too few remain to exclude one.
     """
@@ -64,7 +69,7 @@ class FloorFit:
 
     @property
     def off_mm(self) -> Float[np.ndarray, "point 2"]:
-        """Measured less true x and y of the points, at the points' heights [mm]."""
+        """Positions computed from the points' pixels and heights, less the given x and y [mm]."""
         off = [
             self.camera.on_plane(pixel, float(place[2])) - place[:2]
             for pixel, place in zip(self.points.pixels, self.points.places, strict=True)
@@ -163,8 +168,8 @@ def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
     fits = [FloorFit(camera_of(lens, pose), pose, points) for pose in poses]
     fits.sort(key=lambda fit: fit.rms_px)
     above = [fit for fit in fits if fit.camera.place[2] > 0 and fit.camera.rotation[2, 2] < 0]
-    # the best pose of all may lie below the floor: accept one above it if its error is similar or
-    # small
+    # the best pose of all may lie below the floor: accept a pose above the floor if its error is
+    # similar to that of the best pose, or small
     if not above or above[0].rms_px > max(TWIN_RATIO * fits[0].rms_px, LEAST_BAD_PX):
         return None
     best, *others = above

@@ -14,9 +14,10 @@ COLUMNS = ("u", "v", "x", "y")
 EXPECTED = "u, v (pixels), x, y (metres) and perhaps z"
 """Columns of a file of points, for messages."""
 LEAST_POINTS = 4
+"""Smallest number of points that determine the pose of a camera."""
 LINE_WIDTH = 0.02
-"""Ratio of the points' spread across their main direction to that along it, below which they count
-as lying on one line [1]."""
+"""Ratio of the points' spread across their main direction to the spread along it, up to which the
+points count as lying on one line [1]."""
 
 
 @dataclass(frozen=True, eq=False)

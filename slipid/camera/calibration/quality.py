@@ -20,22 +20,28 @@ from slipid.camera.calibration.lens import (
 from slipid.support.errors import DataError
 
 HELD_OUT_FOLDS = 5
+"""Number of folds into which the views are divided for the held-out error."""
 TILTED_DEG = 12.0
 """Tilt of the board above which a view separates focal length and distance [deg]."""
 LEAST_TILTED = 3
+"""Number of tilted views below which a lens is refused."""
 CELLS = (8, 6)
 """Numbers of cells across and down into which the image is divided, to measure coverage."""
 REFUSED_SHARE, POOR_SHARE = 0.35, 0.6
 """Fraction of the cells with corners below which a lens is refused, and below which it is reported
 as poor [1]."""
 POOR_REACH = 0.6
+"""Value of `Coverage.reach` below which a lens is reported as poor [1]."""
 REFUSED_FOCAL, POOR_FOCAL = 0.02, 0.005
 """Relative std of the focal lengths above which a lens is refused, and above which it is reported
 as poor [1]."""
 POOR_RMS_PX = 1.0
+"""Root mean square error, of the fit or on held-out views, above which a lens is reported as poor
+[pixel]."""
 POOR_RATIO = 2.0
 """Ratio of the held-out error to the fit's error above which a lens is reported as poor [1]."""
 POOR_VIEWS = 10
+"""Number of views below which a lens is reported as poor."""
 
 
 @dataclass(frozen=True, eq=False)

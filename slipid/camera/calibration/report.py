@@ -18,6 +18,7 @@ which a camera is reported as poor."""
 POINTS_SHOWN = 12
 """Number of points, those with the largest errors, that the text lists; the file lists all."""
 UNITS = {"fx": " px", "fy": " px", "cx": " px", "cy": " px"}
+"""Units of the lens parameters that have one, as text after the value."""
 
 
 def lens_report(quality: Quality, left_out: list[str]) -> Content:

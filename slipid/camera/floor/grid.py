@@ -91,7 +91,7 @@ class Rectified:
 def filled(polygon: Float[np.ndarray, "corner 2"], rows: int, columns: int) -> Mask:
     """Return a mask of the grid points in a polygon, whose corners are given as column and row."""
     mask = np.zeros((rows, columns), np.uint8)
-    # OpenCV takes corners as integers: in sixteenths, 4 fractional bits in the last argument below
+    # OpenCV takes corners as integers: give sixteenths, and 4 fractional bits as the last argument
     parts = 16
     corners = np.rint(np.clip(polygon, -1e6, 1e6) * parts).astype(np.int32)
     cv2.fillPoly(mask, [corners.reshape(-1, 1, 2)], 1, cv2.LINE_8, 4)
@@ -180,7 +180,7 @@ def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid:
 
 
 def _before_lens(camera: OverheadCamera, points: Float[np.ndarray, "row column 3"]) -> Mask:
-    """Return a mask of the points in front of the lens, near and within its angle of view.
+    """Return a mask of the points near the camera, in front of it and within its angle of view.
 
     All other points must be excluded, since the distortion of a lens is a polynomial that would map
     points far outside the image back into it.

@@ -22,7 +22,7 @@ mean square misfit of colours [1]."""
 ALTERNATIONS = 6
 """Number of iterations in which illumination and colours are fitted alternately."""
 DARK = 0.03
-"""Linear RGB value up to which noise is about constant and above which noise grows with it [1]."""
+"""Linear RGB value up to which noise is about constant; above it noise grows with the value [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +179,7 @@ def basis_at(at: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, "place funct
 
 
 def _powers() -> list[tuple[int, int]]:
+    """Return the degrees in x and y of the polynomials of `basis_at`, the constant first."""
     return [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
 
 

@@ -152,7 +152,11 @@ def _indices(path: Int[np.ndarray, "step 2"], few: Int[np.ndarray, "corner 2"]) 
 def _fitted(
     middles: Float[np.ndarray, "step 2"], index: list[int], tolerance: float
 ) -> Float[np.ndarray, "corner 2"]:
-    """Return corners moved to intersections of the lines fitted between them; ends stay fixed."""
+    """Return the corners of a path, moved to the intersections of lines fitted to the path.
+
+    Each inner corner moves to the intersection of the lines that are fitted to the path on either
+    side of it, unless this is farther away than `tolerance` allows. The ends stay fixed.
+    """
     lines = [_through(middles[a : b + 1]) for a, b in pairwise(index)]
     out = middles[index].copy()
     for k in range(1, len(index) - 1):
@@ -164,7 +168,7 @@ def _fitted(
         else:
             feet = [on + d * float((out[k] - on) @ d) for on, d in lines[k - 1 : k + 1]]
             meet = (feet[0] + feet[1]) / 2
-        # allow half a step more than the tolerance, since the middles of steps cut corners off
+        # limit the move to the tolerance plus half a step, since the middles of steps cut corners
         if np.linalg.norm(meet - out[k]) <= tolerance + 0.5:
             out[k] = meet
     return out

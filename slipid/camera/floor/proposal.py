@@ -186,7 +186,7 @@ def _relit(illumination: Illumination, samples: ColourSamples) -> Float[np.ndarr
 def matched(
     features: Features, visible: Mask, colours: Float[np.ndarray, "surface 3"]
 ) -> MarkedCells:
-    """Return the middles of patches that match a given colour [linear RGB], with its number."""
+    """Return the middles of patches that match a given colour [linear RGB], and its number."""
     patches = patches_of(features, visible)
     count = len(patches.place)
     own = np.full(count, -1)

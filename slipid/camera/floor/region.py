@@ -37,8 +37,8 @@ from slipid.support.errors import DataError
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
 ABSENT_FROM = 30.0
-"""Distance of a colour to the nearest cells' colours above which it counts as absent from the image
-[CIELAB units]."""
+"""Colour distance for recognising absent colours [CIELAB units]: a colour of the config is absent
+from the image if at least 99.5 % of the visible cells differ from it by more."""
 SCHEMA: Literal["slipid.palette/1"] = "slipid.palette/1"
 Points = Annotated[list[Point], Field(min_length=1)]
 Name = Annotated[str, Field(min_length=1, max_length=60)]
@@ -120,7 +120,7 @@ def palette_text(surfaces: Sequence[str], image: str, before: Palette) -> str:
     """
     lines = [
         f"# Surfaces that `slipid map` proposed for {image}.",
-        "# Rename them. Two with the same name become one surface: where the light differs much,",
+        "# Rename them. Give the same name to surfaces that are one: where the light differs much,",
         "# one surface is often proposed as two. If a surface is missing, add points on it.",
         "# Then run `slipid map IMAGE --config THIS_FILE`, with the other options as before.",
         f'schema = "{SCHEMA}"',
@@ -329,7 +329,7 @@ def _given_colour(region: FloorRegion, name: str) -> Float[np.ndarray, "3"]:
     """Return the linear RGB that the config gives for a surface.
 
     Raises:
-        DataError: no visible cell has nearly that colour.
+        DataError: the colour is absent from the image, see `ABSENT_FROM`.
     """
     code = region.source.palette.palette[name]
     colour, lab = linear_of_code(code), region.features.appearance[region.visible][:, :3]
@@ -337,7 +337,7 @@ def _given_colour(region: FloorRegion, name: str) -> Float[np.ndarray, "3"]:
     if (nearest := float(np.percentile(off, 0.5))) > ABSENT_FROM:
         raise DataError(
             f"{region.source.config}: palette.{name}: '{code}' is nowhere in the image (the "
-            f"nearest is {nearest:.0f} CIELAB units off); expected a colour as the image shows it, "
-            "or points on the surface"
+            f"nearest colour differs by {nearest:.0f} CIELAB units); expected a colour as the "
+            "image shows it, or points on the surface"
         )
     return colour

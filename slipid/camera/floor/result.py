@@ -21,8 +21,8 @@ HARDLY_DISTINCT, NOT_DISTINCT = 5.0, 3.5
 """Differences of appearance below which two surfaces are reported as hard to distinguish, and as
 indistinguishable [spreads within a surface].
 
-If one surface is given two names, the two differ by about 3.2, since each gets one half of the
-surface's spread of colours.
+If one surface is given two names, the two named surfaces differ by about 3.2, since each gets one
+half of the surface's spread of colours.
 """
 MOST_UNKNOWN = 1 / 3
 """Largest fraction of the requested floor that may be unknown in a good map [1]."""
@@ -111,7 +111,7 @@ def map_from(
         )
     number = np.full(len(names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
-    labels = number[labels]  # UNKNOWN is -1 and so picks the last entry, which is UNKNOWN again
+    labels = number[labels]  # UNKNOWN is -1 and so picks the last element of `number`, UNKNOWN
     seen = [np.median(features.rgb[labels == k], axis=0) for k in range(len(present))]
     colours = {names[k]: code_of_linear(rgb) for k, rgb in zip(present, seen, strict=True)}
     colours |= {name: source.palette.palette.get(name, seen) for name, seen in colours.items()}

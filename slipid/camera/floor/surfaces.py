@@ -22,6 +22,7 @@ from slipid.camera.floor.light import (
 from slipid.camera.opencv import Labels, Mask, cv2
 
 MOST_ROUNDS = 10
+"""Largest number of rounds of learning, see `learnt`."""
 STEADY_SHARE = 3e-4
 """Learning ends when less than this fraction of the cells changes its surface in a round [1]."""
 COARSE_CELLS = 25_000
@@ -60,7 +61,7 @@ MarkedCells = Int[np.ndarray, "cell 3"]
 def surroundings(marked: MarkedCells, visible: Mask) -> MarkedCells:
     """Return visible cells around each marked cell, marked with the same surface.
 
-    They are the marked cell and every second cell within `MARK_RADIUS` along rows and columns.
+    These are the marked cell and every second cell within `MARK_RADIUS` along rows and columns.
     """
     steps = np.arange(-MARK_RADIUS, MARK_RADIUS + 1, 2)
     down, across = (step.ravel() for step in np.meshgrid(steps, steps))
@@ -105,10 +106,10 @@ class Surfaces:
         return out
 
     def costs(self, appearance: Float[np.ndarray, "row column 4"]) -> Costs:
-        """Return the cost of each surface in each cell [squared spreads], limited above.
+        """Return the cost of each surface in each cell [squared spreads].
 
-        A wide spread adds to the cost, since otherwise the surface with the widest spread would
-        have the lowest cost in most cells.
+        The cost is at most 1.5 `OUTLIER_COST`. A wide spread adds to the cost, since otherwise the
+        surface with the widest spread would have the lowest cost in most cells.
         """
         out = np.empty((len(self.spread), *appearance.shape[:2]), np.float32)
         for k, expected in enumerate(self.appearances(appearance.shape[:2])):
@@ -206,7 +207,7 @@ def _updated(
     count = np.bincount(own, minlength=len(seeds.colours))
     # small surfaces get larger weights, so that all contribute to the illumination
     weight = 1 / np.sqrt(count[own])
-    weight[len(weight) - len(marked) :] *= 3
+    weight[len(weight) - len(marked) :] *= 3  # a marked cell certainly has its surface
     at, appearance = (
         positions(few.appearance.shape[:2])[cells],
         few.appearance.reshape(-1, 4)[cells],
@@ -227,7 +228,7 @@ def _updated(
 
 
 def labelled(costs: Costs, visible: Mask) -> Labels:
-    """Return the surface of each cell; a cell unlike every surface gets the number of surfaces."""
+    """Return the surface of each cell; `len(costs)` marks a cell that resembles no surface."""
     outlier = np.full((1, *visible.shape), OUTLIER_COST, np.float32)
     return smoothed(np.concatenate([costs, outlier]), visible)
 

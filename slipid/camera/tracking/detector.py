@@ -272,7 +272,7 @@ def _offsets(
 def _intersections(
     edges: _Edges, offsets: Float[np.ndarray, "marker 4 2"]
 ) -> Float[np.ndarray, "marker 4 2"]:
-    """Return the start of each edge, where its fitted line meets the previous edge's [pixel]."""
+    """Return the start of each edge, where its line meets that of the previous edge [pixel]."""
     start = edges.start + edges.outward * offsets[..., :1]
     along = edges.start + edges.along + edges.outward * offsets[..., 1:] - start
     other, other_along = np.roll(start, 1, axis=1), np.roll(along, 1, axis=1)

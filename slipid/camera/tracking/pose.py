@@ -116,7 +116,7 @@ def _on_planes(
     pixels: Float[np.ndarray, "frame corner 2"],
     heights: Float[np.ndarray, " corner"],
 ) -> tuple[Float[np.ndarray, "frame corner 2"], Float[np.ndarray, "frame corner 2 2"]]:
-    """Return x, y of corners at their heights [m], and the derivatives [m/pixel] by pixel u, v."""
+    """Return x, y of corners at their heights [m], and derivatives w.r.t. pixel u, v [m/pixel]."""
     place = np.full(pixels.shape, np.nan)
     slope = np.full((*pixels.shape, 2), np.nan)
     for height in np.unique(heights):
@@ -157,7 +157,7 @@ def _residuals(
     body: _Corners,
     used: Bool[np.ndarray, "frame corner"],
 ) -> tuple[Float[np.ndarray, "frame number"], Float[np.ndarray, "frame number 4"]]:
-    """Return residuals, computed by equation (1) less measured [pixel], and their derivatives.
+    """Return residuals (computed by equation (1) less measured) [pixel], and their derivatives.
 
     Derivatives are with respect to x, y, heading and size. Residuals and derivatives are 0 for
     unused corners.

@@ -13,8 +13,8 @@ body:
     id = 0
     size_m = 0.131
     height_m = 0.25            # above the floor
-    place_m = [0.05, 0.0]      # of its middle on the body, x ahead, y left
-    yaw_deg = 90.0             # of its top edge, counter-clockwise from ahead
+    place_m = [0.05, 0.0]      # position of its middle on the body, x ahead, y left
+    yaw_deg = 90.0             # direction of its top edge, counter-clockwise from ahead
 
     [[target.board]]           # a grid of markers, numbered along its rows
     first_id = 10
@@ -108,7 +108,8 @@ class Target:
             if (height := float(marker.corners[:, 2].max())) >= camera_m:
                 raise DataError(
                     f"{self.name}: marker {marker.id} is {height:g} m above the floor, but the "
-                    f"camera {camera_m:g} m; expected a marker height in metres, below the camera"
+                    f"camera only {camera_m:g} m; expected a marker height in metres, below the "
+                    "camera"
                 )
 
 

@@ -35,6 +35,7 @@ from slipid.exports.c99.sources import MOST_UNROLLED, along
 from slipid.exports.fields import Kind, kind_of
 
 Shaped = jax.ShapeDtypeStruct
+"""Shape and data type of a result."""
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[Builder, tuple[Cell, ...], int], Cell | None]
 """Function that simplifies an operation, given its operands and the number of lanes of the result.
@@ -55,6 +56,7 @@ UNARY = {
     "rsqrt": "R(1.0) / r_sqrt({0})",
     "square": "{0} * {0}",
 }
+"""C expressions of the primitives with one operand; the functions r_... are in prelude.c."""
 BINARY = {
     **{name: f"r_{name}({{0}}, {{1}})" for name in ("atan2", "max", "min", "pow", "rem")},
     **dict.fromkeys(("add", "add_any"), "{0} + {1}"),
@@ -70,6 +72,7 @@ BINARY = {
     "or": "{0} | {1}",
     "sub": "{0} - {1}",
 }
+"""C expressions of the primitives with two operands."""
 INTEGER_TEMPLATES = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
 """Templates of operations whose C expression differs for integers."""
 NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (None, 1.0)}
@@ -100,9 +103,9 @@ def applied(
 def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
     """Return the axis of the lanes of an element-wise result.
 
-    It is the lane axis of the first operand that has lanes and is not broadcast along them. Without
-    such an operand it is the longest axis of a result with more than `MOST_UNROLLED` elements; a
-    smaller result has no lanes, and None is returned.
+    It is the lane axis of the first operand that has lanes and is not broadcast along them. If
+    there is no such operand, it is the longest axis of a result with more than `MOST_UNROLLED`
+    elements; a smaller result has no lanes, and None is returned.
     """
     for value in values:
         axis = axis_of(value)
@@ -118,7 +121,7 @@ def unary(name: str) -> Rule:
         if UNARY[name] == "{0}":
             return values[0]
         if kind_of_value(values[0]) == "int" and name not in ("neg", "square"):
-            raise NoFormError("for integers")
+            raise NoFormError("it is not supported for integers")
         return applied(builder, UNARY[name], kind_of(out.dtype), values, out.shape)
 
     return rule
@@ -150,7 +153,7 @@ def integer_pow(builder: Builder, values: list[Value], params: Params, out: Shap
     """Return an array raised to an integer power by repeated multiplication."""
     power = params["y"]
     if power == 0:
-        raise NoFormError("an exponent of 0")
+        raise NoFormError("an exponent of 0 is not supported")
     product = " * ".join(["{0}"] * abs(power))
     template = product if power > 0 else f"R(1.0) / ({product})"
     return applied(builder, template, kind_of(out.dtype), values, out.shape)
@@ -164,6 +167,7 @@ CONVERTED: dict[tuple[Kind, Kind], str] = {
     ("real", "bool"): "{0} != R(0.0)",
     ("real", "int"): "to_int({0})",
 }
+"""C expressions that convert a number, keyed by its kind before and after."""
 
 
 def converted(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -184,7 +188,7 @@ def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -
         return (yes if which.value else no) if isinstance(which, Constant) else None
 
     if len(values) != 3 or kind_of_value(values[0]) != "bool":
-        raise NoFormError("more than two cases")
+        raise NoFormError("more than two cases are not supported")
     kind = kind_of(out.dtype)
     return applied(builder, "{0} ? {2} : {1}", kind, values, out.shape, simpler)
 
@@ -211,7 +215,7 @@ def reduced(name: str) -> Rule:
         kind, lanes, template, first = value.kind, value.lanes, real_template, start
         if kind == "int":
             if start_of_ints is None:
-                raise NoFormError("for integers")
+                raise NoFormError("it is not supported for integers")
             template, first = template.replace("r_", "i_"), start_of_ints
         rest = [d for d in range(len(value.shape)) if d != value.axis]
         over = [rest.index(d) for d in axes if d != value.axis]
@@ -236,7 +240,7 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     """Return the index of the smallest element, or of the first NaN if there is one."""
     value = values[0]
     if len(value.shape) > 1 or kind_of_value(value) != "real":
-        raise NoFormError("only for an array of real numbers with one axis")
+        raise NoFormError("it is supported only for an array of real numbers with one axis")
     cell, lanes = along(builder, value, value.shape, 0).item(), value.shape[0]
     least = builder.compute("real", "r_min({acc}, {0})", (cell,), lanes, "R_INFINITY")
     which = At(builder.names.table(np.arange(lanes), "int"), 0, 1)
@@ -246,7 +250,7 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
 
 
 def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return the product of two arrays that `dot_general` of JAX computes."""
+    """Return the product of two arrays as the JAX primitive `dot_general` defines it."""
     summed, batch = params["dimension_numbers"]
     free = [
         [d for d in range(len(v.shape)) if d not in (*summed[k], *batch[k])]
@@ -277,8 +281,8 @@ def _ordered(
 ) -> Cells:
     """Transpose cells to the order of axes in `order`, and merge each group of axes into one.
 
-    Axes are those of the array, whose shape is `shape`. The cells lack `axis`, the axis of the
-    lanes.
+    `order` lists axes of the array that the cells belong to. The array has the shape `shape`, and
+    its lanes are along `axis`, which is not an axis of the cells.
     """
     dims = [d for d in range(len(shape)) if d != axis]
     groups = [[d for d in part if d != axis] for part in order]
@@ -313,6 +317,10 @@ def _lane_axes(
 def _dot_one(
     builder: Builder, left: Cells, right: Cells, kind: Kind, lanes: int, summed: bool
 ) -> Cell:
+    """Return the cell of one element of a product: the sum of the products of two rows of cells.
+
+    If `summed` is True, the sum also runs over the lanes.
+    """
     terms: list[str] = []
     cells: list[Cell] = []
     for a, b in zip(left, right, strict=True):

@@ -3,7 +3,7 @@
 Every expression is computed once, in the earliest block in which its inputs are known. A block is
 straight-line code or one loop over lanes (the elements along one axis of an array), so that many
 operations on arrays of the same length share one loop. Expressions that are the same in all
-iterations of a repetition are computed before it.
+iterations of a repetition are computed before the repetition.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Names:
         return self._last
 
     def table(self, values: np.ndarray, kind: Kind) -> Memory:
-        """Return a table of these constants, the earlier table if equal constants have one."""
+        """Return the table that holds these constants; equal constants share one table."""
         flat = np.ascontiguousarray(values.reshape(-1), dtype=DTYPES[kind])
         key = (kind, flat.tobytes())
         if key not in self.tables:
@@ -52,12 +52,13 @@ class Builder:
     """Collector of the statements of a function, or of the body of a condition or repetition.
 
     Attributes:
+        names: serial numbers and constant tables of the generated file.
         parent: builder of the surrounding code; None for the body of a function.
         turns: block that repeats this builder's code; None outside of repetitions.
         blocks: blocks in order of execution.
         source: file and line of the Python code from which the next statement is generated.
-        contiguous: arrays that were also stored in row-major order, with the memory that holds
-            them, keyed by the `id` of their cells.
+        contiguous: for each array that was also stored in row-major order, the array and the memory
+            that holds it, keyed by the `id` of the array's cells.
     """
 
     def __init__(self, names: Names, parent: Builder | None = None):
@@ -79,12 +80,13 @@ class Builder:
         """Return the variable of an expression, after appending its statement if it is new.
 
         Args:
-            kind: kind of the number.
+            kind: kind of the result.
             template: C expression with the placeholders {0}, {1}, ... for the cells.
             cells: cells for the placeholders.
             lanes: number of lanes; it is ignored if no cell varies over the lanes, except in a
                 reduction.
-            start: initial value of a reduction over the lanes to one number; empty for none.
+            start: initial value of a reduction over the lanes to one number; empty if the
+                expression is not a reduction.
         """
         lanes = lanes if start or any(map(varies, cells)) else 0
         around = self._outermost(cells)
@@ -105,12 +107,12 @@ class Builder:
         return self._known[key]
 
     def array(self, kind: Kind, size: int, cells: tuple[Cell, ...], lanes: int = 0) -> Memory:
-        """Return new memory, to be written in the earliest block in which `cells` are known."""
+        """Return new memory for `fill`, in the earliest block in which `cells` are known."""
         home = self._outermost(cells)._place(cells, lanes)
         return Memory(f"m{self.names.number()}", kind, size, home)
 
     def fill(self, memory: Memory, template: str, cell: Cell, times: int = 0) -> None:
-        """Append a C statement that writes `cell` to memory of `array`.
+        """Append a C statement that writes `cell` to memory that `array` returned.
 
         If `times` is not 0, the statement is in a loop with that number of iterations.
         """
@@ -129,8 +131,8 @@ class Builder:
     def _outermost(self, cells: tuple[Cell, ...]) -> Builder:
         """Return the builder to which a statement that reads `cells` belongs.
 
-        It is the innermost builder whose repetition changes any of the cells, so that the statement
-        is moved out of repetitions that do not change its result.
+        The statement is moved out of every repetition in which none of the cells changes, but not
+        out of the body of a condition.
         """
         if self.parent is None or self.turns is None or any(map(self._changes, cells)):
             return self
@@ -169,7 +171,7 @@ class Builder:
     def _next_to(self, home: CodeBlock | None, together: bool) -> int:
         """Return the index of the first block that can use values of the block `home`.
 
-        It is `home` itself if `together`, else the block after it.
+        The result is the index of `home` itself if `together` is True, else of the next block.
         """
         if home is None or home.owner is not self:
             return 0  # the values exist before the code of this builder begins

@@ -22,6 +22,7 @@ from slipid.robot.interface import Readings
 from slipid.robot.trajectory import Path
 
 C_TYPES = {**TYPES, "real": "slipid_real"}
+"""C type of each kind of number in slipid.h."""
 
 
 class Code:
@@ -33,8 +34,8 @@ class Code:
         path: path that `slipid_follow` follows.
         estimator: struct of the estimator's state.
         controller: struct of the controller's state.
-        reading: struct of the inputs.
-        estimate: struct of the outputs.
+        reading: struct of the sensors' readings, the input of the estimator.
+        estimate: struct of the estimator's output.
         structs: all structs.
         functions: all generated functions.
     """
@@ -66,6 +67,7 @@ class Code:
             return loop.init(pose).estimator, loop.init(pose).controller
 
         def follow(time: jax.Array, pose: jax.Array, dt: jax.Array) -> object:
+            # an invalid pose counts as far from the path, which then waits
             here = jnp.where(jnp.isfinite(pose), pose, 1e3)
             return path.follow(time, here, dt, loop.controller.gains.preview)
 

@@ -111,8 +111,9 @@ def function(
         names: unique names and constant tables of the generated file.
         name: name of the C function.
         arguments: arguments of the C function in order.
-        run: function of JAX. Its inputs are the structs' trees of all arguments that are read, and
-            its results the trees of all arguments that are written, in the arguments' order.
+        run: function of JAX. Its inputs are trees like `Struct.example` of all arguments that are
+            read; its results are such trees of all arguments that are written. Both are in the
+            order of `arguments`.
 
     Raises:
         UnsupportedError: the function uses a primitive without a rule.
@@ -141,9 +142,9 @@ def function(
 
 
 def traced(run: Callable[..., object], *like: object) -> Traced:
-    """Trace a function of trees as a function from the arguments' leaves to the result's leaves.
+    """Trace a function of trees, as a function of all leaves that returns the result's leaves.
 
-    `like` are example arguments.
+    `like` are example arguments of the function.
     """
     structure = jax.tree.structure(like)
 

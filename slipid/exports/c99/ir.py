@@ -115,7 +115,7 @@ class Variable:
 
     @property
     def memory(self) -> Memory:
-        """Stack array with one number per lane, from which blocks other than `home` read it."""
+        """Stack array with a number per lane; blocks other than `home` read the variable there."""
         return Memory(f"m{self.number}", self.kind, self.lanes, self.home, lanes=True)
 
 
@@ -183,7 +183,8 @@ class Array:
     Attributes:
         shape: shape of the array.
         kind: kind of its numbers.
-        axis: axis of the lanes; None without lanes.
+        axis: axis of the lanes (see the module), along which C code loops; None if every element
+            has a cell of its own.
         cells: cells, in the array's shape without the axis of the lanes.
     """
 

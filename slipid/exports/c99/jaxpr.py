@@ -49,9 +49,9 @@ class Traced:
 
     @classmethod
     def of(cls, written: object) -> Traced:
-        """Return a traced function from an object in which JAX represents a function.
+        """Return a traced function from JAX's own representation of it.
 
-        JAX 0.10 has two classes for such objects, while later versions have one.
+        JAX 0.10 has two classes that represent functions, later versions have one.
 
         Raises:
             DataError: this version of JAX represents functions in an unsupported way.
@@ -120,7 +120,7 @@ def source_line(equation: JaxprEqn) -> str:
 
 
 def unknown(what: str) -> DataError:
-    """Return the error for a part of JAX that this version represents in an unsupported way."""
+    """Return the error for a part of JAX that the installed version represents differently."""
     return DataError(
         f"jax {jax.__version__} represents {what} in a way that this version of slipid does not "
         f"support; expected a supported version: pip install 'jax{KNOWN}'"

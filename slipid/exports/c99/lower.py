@@ -56,8 +56,9 @@ RULES: dict[str, Rule] = {
 }
 """Rules that convert a primitive of JAX to C, keyed by the primitive's name.
 
-Primitives in `MOVES`, which only move elements, need no rule here: at export they are applied to
-the indices of the elements, which shows the origin of each element of the result (`moved`)."""
+Primitives in `MOVES` only move elements. At export `moved` applies them to the elements' indices,
+which shows the origin of each element of the result. The rules of `dynamic_slice` and `gather` are
+for indices that are computed at run time."""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
 """Primitives that call another traced function, whose statements are inlined."""
 
@@ -105,8 +106,8 @@ def _results(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
     except NoFormError as error:
         known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
         raise UnsupportedError(
-            f"{builder.source}: the JAX primitive '{name}' has no form in C ({error}); use "
-            f"primitives out of {', '.join(known)}"
+            f"{builder.source}: the JAX primitive '{name}' has no form in C ({error}); use only "
+            f"these primitives: {', '.join(known)}"
         ) from error
 
 
@@ -117,10 +118,11 @@ def _by_rule(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[
         return _cond(builder, params, values)
     if name == "scan":
         return _scan(builder, params, values)
-    out: Any = equation.outvars[0].aval  # JAX's type for it does not declare shape and dtype
+    # JAX's type annotation of `aval` has no shape and dtype
+    out: Any = equation.outvars[0].aval
     shaped = Shaped(out.shape, out.dtype)
     if out.dtype not in _TYPES:
-        raise NoFormError(f"numbers of type {out.dtype}")
+        raise NoFormError(f"numbers of type {out.dtype} are not supported")
     if name in ("split", "unstack"):
         parts = primitive.bind(numbered(values[0].shape), **equation.params)
         return [rearranged(builder, values[:1], np.asarray(part)) for part in parts]
@@ -136,7 +138,7 @@ def _cond(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
     """Append an if-else whose branches are the functions of a `cond`, and return its results."""
     which, choices = values[0], branches(params)
     if len(choices) != 2:
-        raise NoFormError("more than two branches")
+        raise NoFormError("more than two branches are not supported")
     if not isinstance(which, Array):
         return lowered(builder, choices[int(np.clip(which, 0, 1))], values[1:])
     bodies = [Builder(builder.names, builder) for _ in range(2)]
@@ -155,7 +157,7 @@ def _cond(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
 
 
 def _memory(builder: Builder, like: Value, block: CodeBlock) -> Memory:
-    """Return new memory of the kind and size of a value, written in a block."""
+    """Return new memory with the kind and size of the value `like`, written in `block`."""
     return Memory(f"m{builder.names.number()}", kind_of_value(like), prod(like.shape), block)
 
 
@@ -164,7 +166,7 @@ def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
     scan = ScanParameters.of(params)
     carried, consts = scan.carried, scan.constants
     if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
-        raise NoFormError("a scan over an array")
+        raise NoFormError("a scan over an array is not supported")
     body = Builder(builder.names, builder)
     body.turns = CodeBlock(builder, times=scan.turns, bodies=[body])
     begun = values[consts:]
@@ -182,9 +184,9 @@ def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
 
 
 def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
-    """Return a result without cells in memory that is about to be overwritten.
+    """Return a result whose cells in memory called `overwritten` are copied to variables.
 
-    Such cells are copied to variables first. `overwritten` has the names of the memory.
+    That memory is about to be overwritten, so these cells would change.
     """
     if not isinstance(value, Array):
         return value

@@ -90,13 +90,13 @@ def _scattered(
     in row-major order.
     """
     if isinstance(where, Array):
-        raise NoFormError("indices that are not constant")
+        raise NoFormError("indices that are not constant are not supported")
     kept = {k: params[k] for k in ("dimension_numbers", "indices_are_sorted", "mode")}
     new = fresh + numbered(shape)
     options = {**kept, "unique_indices": False}
     times = lax.scatter_add(np.zeros(old.shape, int), where, np.ones(shape, int), **options)
     if np.max(times, initial=0) > 1:
-        raise NoFormError("an index that occurs twice")
+        raise NoFormError("an index that occurs twice is not supported")
     return np.asarray(lax.scatter(old, where, new, **options))
 
 
@@ -131,9 +131,9 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     whole, where = values
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
-        raise NoFormError("batches of indices")
+        raise NoFormError("batches of indices are not supported")
     if params["mode"] == lax.GatherScatterMode.FILL_OR_DROP:
-        raise NoFormError("a mode in which indices out of range give a fill value")
+        raise NoFormError("indices out of range give a fill value, which is not supported")
     memory = contiguous(builder, whole)
     batch = [d for d in range(len(out.shape)) if d not in numbers.offset_dims]
     kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]

@@ -33,7 +33,7 @@ from slipid.exports.c99.ir import (
 from slipid.exports.fields import kind_of
 
 MOST_UNROLLED = 64
-"""Largest number of elements of an array up to which it is unrolled in C."""
+"""Largest number of elements of an array that is unrolled in C instead of becoming a loop."""
 
 
 class Sources:
@@ -88,7 +88,7 @@ class Sources:
         return sum(self._ready_cell(row) is not None for row in flat)
 
     def _ready_cell(self, row: np.ndarray) -> Cell | None:
-        """Return the cell of a source whose lanes are the elements with indices `row`, or None."""
+        """Return the cell of a source whose lanes have the indices (places) `row`, or None."""
         source, _ = self._source(int(row[0]))
         if not isinstance(source, Array) or source.axis is None or source.lanes != len(row):
             return None
@@ -114,7 +114,7 @@ class Sources:
         return At(cell.memory, cell.offset + cell.stride * lane, index=cell.index)
 
     def row(self, row: np.ndarray) -> Cell:
-        """Return a cell whose lanes are the elements with indices `row`."""
+        """Return a cell whose lanes are the elements with the indices (places) `row`."""
         ready = self._ready_cell(row)
         if ready is not None:
             return ready
@@ -141,7 +141,7 @@ class Sources:
         return At(first.memory, 0, table=self._builder.names.table(places, "int"))
 
     def _laned_source(self, row: np.ndarray) -> Value | None:
-        """Return the source with lanes that contains all elements of a row; None without one."""
+        """Return the source that contains all elements with indices `row`, if it has lanes."""
         source, *others = (self._source(int(place))[0] for place in row)
         same = all(other is source for other in others)
         return source if same and axis_of(source) is not None else None
@@ -166,7 +166,7 @@ class Sources:
         return memory
 
     def _copy(self, memory: Memory, start: int, group: list[Cell]) -> None:
-        """Copy a single element, or evenly spaced elements, to memory from index `start` on."""
+        """Copy a single cell, or evenly spaced cells, to memory, beginning at index `start`."""
         first, *rest = group
         if not rest:
             self._builder.fill(memory, f"{{memory}}[{start}] = {{0}};", first)
@@ -203,7 +203,7 @@ def _contiguous(builder: Builder, value: Array) -> Memory:
 
 
 def _places(cells: Sequence[Cell]) -> np.ndarray | None:
-    """Return the offsets of cells in memory; None unless all cells are in the same memory."""
+    """Return the cells' offsets in memory; None unless all have the same memory and `At.index`."""
     first = cells[0]
     for cell in cells:
         if not isinstance(cell, At) or not isinstance(first, At):

@@ -19,8 +19,8 @@ class Usage:
     """Liveness analysis: which statements and arrays of a builder are used, and when.
 
     The code is scanned backwards from its end, since a statement is needed if a later statement
-    uses its result. The step number therefore counts down from 0, so that an earlier step of the
-    program has a smaller number.
+    uses its result. Each scanned block gets the next step number, counted down from 0, so that an
+    earlier block of the program has a smaller number.
 
     Attributes:
         live: `id` of each statement that is needed.
@@ -97,14 +97,14 @@ class Usage:
             self._use_array(memory)
 
     def _use_array(self, memory: Memory) -> None:
-        """Extend the life of an array to the present step."""
+        """Extend the life of an array to the step of the block that is being scanned."""
         life = self._lives.setdefault(memory.name, _Life(memory, self._step, self._step))
         life.first = min(life.first, self._step)
 
 
 @dataclass
 class _Life:
-    """First and last step of the program at which an array is used."""
+    """First and last step of the program (see `Usage`) at which an array is used."""
 
     memory: Memory
     first: int
@@ -147,7 +147,9 @@ def _shared(arrays: list[_Life]) -> dict[str, StackArray]:
 TYPES: dict[Kind, str] = {"real": "real_t", "int": "int32_t", "bool": "bool"}
 """C type of each kind of number."""
 CODE_WIDTH = 100
+"""Largest length of a line of generated C [characters]."""
 FLOAT_MAX = float(np.finfo(np.float32).max)
+"""Largest 32-bit float; larger constants are written with the macro R_WIDE of prelude.c."""
 
 
 def number(value: float | int | bool, kind: Kind) -> str:
@@ -181,7 +183,7 @@ def wrapped(words: Iterable[str], indent: str) -> list[str]:
 
 
 class FunctionBody:
-    """C text of the code of a builder, without unused statements.
+    """C text of the blocks of a builder, without unused statements.
 
     Attributes:
         lines: lines of declarations and statements.
@@ -254,7 +256,7 @@ class FunctionBody:
         return [f"{indent}{text}"]
 
     def _where(self, statement: Statement, indent: str) -> list[str]:
-        """Return a comment with a statement's Python line, unless it is the last comment's line."""
+        """Return a comment with a statement's Python line, unless the last comment had it."""
         if statement.source == self._source:
             return []
         self._source = statement.source

@@ -5,11 +5,11 @@ The drive controllers convert a body twist (vx, vy, yaw rate W) to wheel speeds 
     omni      r w_k = sin(t_k) vx - cos(t_k) vy - R W,   t_k = wheel_offset + 2 pi k / n
     mecanum   r w   = vx -/+ vy -/+ s W,                 s = lx + ly
 
-where w_k is the speed of wheel k [rad/s], r the wheel radius [m] and R the base radius [m]. The n
-omni wheels are evenly spaced on a circle and numbered counter-clockwise from 0; a positive speed
-turns the robot clockwise. For mecanum wheels the twist is that of the middle of the wheels; the two
-signs are - - front left, + + front right, - + rear right and + - rear left; lx and ly are half the
-wheelbase and half the track [m].
+where w_k is the speed of wheel k [rad/s], t_k its direction from the middle [rad], r the wheel
+radius [m] and R the base radius [m]. The n omni wheels are evenly spaced on a circle and numbered
+counter-clockwise from 0; a positive speed turns the robot clockwise. For mecanum wheels the twist
+is that of the middle of the wheels; the two signs are - - front left, + + front right, - + rear
+right and + - rear left; lx and ly are half the wheelbase and half the track [m].
 
 Source: github.com/ros-controls/ros2_controllers, `compute_robot_velocity` of
 omni_wheel_drive_controller, `update_and_write_commands` of mecanum_drive_controller.
@@ -29,6 +29,7 @@ LARGEST_DIFFERENCE = 0.05
 The difference is the largest error of a rim speed, as a fraction of the body's speed [1]; while the
 body turns on the spot, its speed is the speed of points on the base radius."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
+"""Names of the four wheels in the parameters of mecanum_drive_controller, in its order."""
 
 
 @dataclass(frozen=True)
@@ -86,16 +87,16 @@ def _with_signs(
 
 
 def _difference(robot: DeployedRobot, kinematics: Float[np.ndarray, "wheel 3"]) -> float:
-    """Return the measure of `LARGEST_DIFFERENCE` for a difference of kinematics matrices [1]."""
+    """Return the largest error, as in `LARGEST_DIFFERENCE`, for a difference of matrices J [1]."""
     scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
     return float(np.abs(kinematics * scale).max())
 
 
 def _omni(robot: DeployedRobot) -> DriveController | None:
-    """Return the controller for omni wheels evenly spaced on a circle, from the first wheel on.
+    """Return the controller for omni wheels evenly spaced on a circle, beginning at wheel 0.
 
-    The result is None for fewer than three wheels. Other arrangements of wheels show as a large
-    `difference`.
+    The result is None for fewer than three wheels. For other arrangements of wheels the result has
+    a large `difference`.
     """
     places, count = np.asarray(robot.places), robot.wheels
     if count < 3:

@@ -48,7 +48,7 @@ DIRECTIONS = 24
 
 @dataclass(frozen=True)
 class OdometryErrors:
-    """Errors of odometry on a floor, along, across and in yaw.
+    """Errors of odometry on a floor: along and across the direction of travel, and in yaw.
 
     Attributes:
         floor: name of the floor.
@@ -89,7 +89,7 @@ class OdometryErrors:
         return _larger_in_plane((e * speed) ** 2 + q**2 * speed / period)
 
     def walk(self, speed: float, distance: float) -> Axes:
-        """Return variances per second of a random walk in place of the constant error.
+        """Return the variances per second of a random walk that replaces the constant error.
 
         After the path length d [m] at the speed v [m/s] the std of the walk equals the constant
         error e d, so the variance per second is e^2 d v [m^2/s, m^2/s, rad^2/s].
@@ -147,6 +147,7 @@ def _larger_in_plane(row: Float[np.ndarray, "3"]) -> Axes:
 FILTER_NODE = "ekf_filter_node"
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
+"""States of the filter, in the filter's order."""
 FUSED = ("vx", "vy", "vyaw")
 """States that the filter reads from odometry messages. The messages' pose is not used, since it is
 the integral of the same velocities."""

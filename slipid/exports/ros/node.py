@@ -40,7 +40,7 @@ def _choices(robot: DeployedRobot) -> Iterator[Parameter]:
 
 
 def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Yield every parameter in the robot's record, grouped, in the order of declarations."""
+    """Yield every parameter in the robot's record, one group of parameters after the other."""
     floors = dict(zip(robot.labels, identifiers(robot.labels, "floor"), strict=True))
     names = [load.name for load in robot.record.loads]
     loads = dict(zip(names, identifiers(names, "load"), strict=True))

@@ -13,7 +13,8 @@ robot has left the floor:
     e <- k e + sqrt(1 - k^2) noise,   v <- u + a (v - u)
 
 where `far` is the path length of the step [m], k the correlation of the effect over the step, v the
-settled direction (u after a low-pass filter), and `left` is 1 if no wheel is on the floor, else 0.
+settled direction (u after a low-pass filter with the factor a), and `left` is 1 if no wheel is on
+the floor, else 0.
 If the direction changes at once from v to u, the correlation becomes
 exp(-|u - v|^2 / (2 DIRECTION_STD^2)), in however many steps it is computed. Jitter of the direction
 barely changes the correlation, and on a drive back the effect is independent of the effect on the
@@ -30,7 +31,7 @@ from jaxtyping import Array, Bool, Float
 
 DIRECTION_STD = 0.17
 """Width sigma of the Gaussian over changes of direction with which an effect decorrelates [rad];
-10 deg were estimated from real logs."""
+the value, 10 deg, was estimated from real logs."""
 SETTLING_LENGTH = 0.03
 """Path length constant of the low-pass filter of the direction of travel [m]."""
 LEAVING_LENGTH = 0.1

@@ -46,6 +46,7 @@ def _spread() -> Float[np.ndarray, "sample 3"]:
 
 
 SPREAD = _spread()
+"""Standard pose samples; the root of a covariance scales them to samples of a pose."""
 
 
 class Floor(eqx.Module):

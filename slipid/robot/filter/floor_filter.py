@@ -88,7 +88,7 @@ class BodyMotion(eqx.Module):
         known: probability of every hypothesis after this step, given that one of them is true.
         before: probability like `known`, but without the evidence of this step.
         under: probability of each floor under each wheel, given that one hypothesis is true.
-        jump: change of the pose beyond the mean twist, caused by late evidence [m, m, rad].
+        jump: change of the pose by late evidence, added to the motion by the twist [m, m, rad].
         correction: change of the mean twist caused by this step's evidence [m/s, m/s, rad/s].
     """
 
@@ -196,8 +196,8 @@ class FloorFilter(eqx.Module):
     def _remaining_std(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Return the remaining std of every floor's effects as a fraction of the whole std [1].
 
-        The whole std is the std without an effect table. It remains while wheels are on several
-        floors, since the table's estimates are for all wheels on one floor.
+        The whole std is the std without an effect table. While wheels are on several floors the
+        whole std remains, since the table's estimates are for all wheels on one floor.
         """
         alone = known[hypotheses_of(self.robot).uniform]
         share = alone / jnp.maximum(self.robot.rest @ under, 1e-12)
@@ -295,7 +295,11 @@ class FloorFilter(eqx.Module):
     def _after_floor_changes(
         self, old: FloorState, xi: Array, tick: TimeStep, mapped: Array | None
     ) -> tuple[Array, Array]:
-        """Return probabilities and relative poses after wheels may have changed floors."""
+        """Return probabilities and relative poses after wheels may have changed floors.
+
+        A change leads to the "unknown" floor with probability 0.05; while the floor is unknown, a
+        change leads back to the hypotheses with probability 0.2.
+        """
         known, unknown = jnp.maximum(old.belief[:-1], 1e-12), old.belief[-1]
         sure = jnp.sum(known)
         speed = length((known @ xi)[:2] / sure)
@@ -316,8 +320,8 @@ class FloorFilter(eqx.Module):
     def _changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
         """Return the belief after each wheel in turn may have changed its floor.
 
-        The new floor is drawn by the prior, given the floors under the other wheels. Columns of `p`
-        are the probability and its products with the relative pose.
+        The new floor is drawn from the prior, given the floors under the other wheels. The columns
+        of `p` are the probability and its products with the relative pose.
         """
         prior, none = self.prior(), jnp.zeros((1, p.shape[1]))
         for beside in hypotheses_of(self.robot).beside:
@@ -348,8 +352,8 @@ class FloorFilter(eqx.Module):
         """Return poses of the hypotheses relative to their mean, and the jump of the mean pose.
 
         Each hypothesis moves on from its own pose with its own twist, whose yaw rate is replaced by
-        the gyro's if there is a gyro. The jump is the change of the mean pose beyond the mean
-        twist, which late evidence on the floors causes.
+        the gyro's if there is a gyro. The jump is the change of the mean pose less the motion
+        by the mean twist; late evidence on the floors causes it.
         """
         xi = xi.at[:, 2].set(jnp.where(jnp.isfinite(turn), turn, xi[:, 2]))
         poses = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, tick.dt))
@@ -378,5 +382,5 @@ def _followed(
 
 
 def length(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:
-    """Return the length of a vector, with 1e-24 added under the root for a derivative at zero."""
+    """Return the length of a vector; 1e-24 under the root gives it a derivative at zero."""
     return jnp.sqrt(jnp.sum(v * v, axis=-1) + 1e-24)

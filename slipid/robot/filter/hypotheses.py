@@ -1,9 +1,9 @@
 """Hypotheses about the floors under all wheels of a robot.
 
 The number of assignments of floors to wheels grows as floors^wheels: 625 for four wheels on five
-floors. The edge of a floor is nearly straight on the scale of a robot, so going around the robot
-from wheel to wheel the floor changes at most twice: every hypothesis has one floor, or two floors
-with neighbouring wheels on each. That leaves 125 of the 625, and 21 of the 27 for three wheels on
+floors. The edge of a floor is nearly straight on the scale of a robot, so the floor changes at most
+twice from wheel to wheel around the robot: every hypothesis has one floor, or two floors with
+neighbouring wheels on each. That leaves 125 of the 625, and 21 of the 27 for three wheels on
 three floors. Three floors at once, where patches meet at a corner, are represented by the most
 similar hypothesis or by "unknown". A hypothetical floor (`slipid.robot.unseen`) is under all wheels
 or under none.
@@ -19,7 +19,7 @@ from jaxtyping import Bool, Int
 from slipid.robot.deployed import RobotArrays
 
 MOST_CHANGES = 2
-"""Largest number of floor changes from wheel to wheel when going around the robot."""
+"""Largest number of floor changes from wheel to wheel around the robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,5 +74,5 @@ def _hypotheses(around: tuple[int, ...], unseen: tuple[bool, ...], changes: int)
 
 
 def _changes(row: tuple[int, ...], around: tuple[int, ...]) -> int:
-    """Return the number of floor changes from wheel to wheel when going around the robot."""
+    """Return the number of floor changes from wheel to wheel around the robot."""
     return sum(row[a] != row[b] for a, b in zip(around, around[1:] + around[:1], strict=True))

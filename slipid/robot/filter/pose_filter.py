@@ -133,6 +133,7 @@ class PoseFilter(eqx.Module):
         return new, twist, world.T @ left @ world
 
     def _step_motion(self, motion: BodyMotion, gyro: Array) -> _StepMotion:
+        """Return the motion of a step with its derivatives, from the result of the floor filter."""
         share = self.robot.rest @ motion.under
         speed, axes = motion.rolled.speed, motion.rolled.axes
         std = speed * share[:, None] * motion.left

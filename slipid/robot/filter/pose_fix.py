@@ -15,7 +15,7 @@ HISTORY_STEPS = 48
 """Number of entries in the history, the last step included; it limits the age of a delayed
 measurement."""
 MAP_EXPONENT = 0.25
-"""Exponent on the likelihood that the belief about floors gives a pose [1]. It is below 1 because
+"""Exponent of the likelihood that the belief about floors gives a pose [1]. It is below 1 because
 an error of the map affects many steps, so that the evidence of these steps is not independent."""
 
 
@@ -221,8 +221,8 @@ def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Arra
 def rebased(now: PoseState) -> PoseState:
     """Return the state with noise and path length counted from the oldest entry of the history.
 
-    Noise and path length then stay small even on long drives, as do the ages that the history
-    stores instead of times, so that 32-bit numbers suffice.
+    Noise and path length then stay small even on long drives, so that 32-bit numbers suffice. For
+    the same reason the history stores ages instead of times.
     """
     first = now.history[-1, 5:]
     history = now.history.at[:, 5:].add(-first)

@@ -59,8 +59,8 @@ def read_wheels(
 ) -> WheelState:
     """Return the motion of the wheels one time step `dt` [s] later.
 
-    A wheel without readings keeps its speed until it is stale, then it counts as at rest. When its
-    encoder returns, the next step includes the motion that was missed in between.
+    A wheel without readings keeps its speed until it is stale, then it counts as at rest. When the
+    encoder's readings return, the next step includes the motion missed in between.
     """
     most = 4.0 * robot.highest[0]
     turned = (z.wheel_angle - old.angle) / jnp.maximum(dt, 1e-3)
