@@ -17,11 +17,12 @@ GEAR_STD = 0.3
 NAMES = ("resistance", "back_emf", "brush_drop", "coulomb_friction", "viscous_friction")
 """Names of the parameters taken from a bench. Sensor offsets are not taken, since they belong to
 the meters of the bench."""
-_EXPECTED = "what `slipid identify` of a motor, or `slipid motor --out`, wrote"
+_EXPECTED = "the identified.json that `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
 Identified = dict[str, list[tuple[float, float]]]
-"""Value and std of a parameter for each motor in which it is identified, keyed by its name."""
+"""Value and std of a parameter for each motor in which it is identified, keyed by the parameter's
+name."""
 
 
 def bench_of(config: Config) -> tuple[Path, Identified] | None:
@@ -41,7 +42,7 @@ def bench_of(config: Config) -> tuple[Path, Identified] | None:
 
 
 def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[str]]:
-    """Return priors of `motor.*` from a config's bench file, and lines about which were taken.
+    """Return priors of `motor.*` from a config's bench file, and lines about the used parameters.
 
     With a gear ratio n, a friction torque at the shaft is n times as large at the wheel, and a
     friction torque per speed is n^2 times as large.
@@ -63,7 +64,7 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
         choices.append(Choice(f"motor.{name}", prior_mean=times * mean, prior_std=times * std))
     lines = [f"motor from {path}: {', '.join(c.pattern for c in choices) or 'nothing'}"]
     if left_out := [name for name in NAMES if name not in known]:
-        lines.append(f"not taken from {path}, not identified there: {', '.join(left_out)}")
+        lines.append(f"not taken from {path}, since not identified there: {', '.join(left_out)}")
     return choices, lines
 
 

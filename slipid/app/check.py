@@ -52,9 +52,9 @@ def _braking(task: FitTask) -> Iterator[Finding]:
         yield Finding(
             "braking_unseen",
             "currents are magnitudes, and in turns a wheel that is dragged along brakes: its "
-            "current would be taken as a driving current, and with the voltage give a wrong "
-            "resistance and back-EMF",
-            "log currents with their sign, or take the voltage out of the layout",
+            "current would be treated as a driving current, and would give, together with the "
+            "voltage, a wrong resistance and back-EMF",
+            "log currents with their sign, or remove the voltage from the layout",
             "wrong",
         )
 
@@ -70,8 +70,9 @@ def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
     taken = {"mass_kg": f"{float(task.robot.body.mass):g} kg", "gear_ratio": "1"}
     yield Finding(
         "forgotten",
-        f"{' and '.join(f'{n} ({taken[n]} would be taken)' for n in absent)} left out of [robot], "
-        f"though a {' and a '.join(logged)} is logged: motor and friction scale with them",
+        f"{' and '.join(f'{n} ({taken[n]} would be used)' for n in absent)} missing in [robot], "
+        f"though a {' and a '.join(logged)} is logged: motor and friction parameters scale with "
+        f"{'them' if len(absent) > 1 else 'it'}",
         "write " + " and ".join(f"{n} = ..." for n in absent) + " into [robot]",
         "wrong",
     )
@@ -103,6 +104,7 @@ _CHANNELS = (
     *("wheel_speed", "wheel_speed_command", "twist_command", "current", "voltage"),
     *("duty", "bus_voltage", "gyro", "pose"),
 )
+"""Channels that check.json lists if they are logged, in this order."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,7 @@ def check(
     try:
         estimates_before = expected(task, task.problem())
     except DataError as error:  # the logs leave no windows to fit
-        message = f"nothing can be expected of a fit: {error}"
+        message = f"no estimate of a fit can be predicted: {error}"
         estimates_before = ExpectedEstimates({}, {}, (message,))
     content |= estimates_before.to_json()
     if out is not None:
@@ -159,8 +161,8 @@ def check(
 def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
     """Return the part of check.json about the logs.
 
-    It has the findings, the runs by floor, load set-up and session, the channels, the repairs by
-    the reader, and the `skipped` logs.
+    This part has the findings, the runs by floor, load set-up and session, the channels, the
+    repairs made when the logs were read, and the `skipped` logs.
     """
     data = task.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}
@@ -218,9 +220,9 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
     """Return the expected estimates from the expected information at the start of a fit.
 
     The noise variances are estimated from the runs. The parameters of the floors are not known yet;
-    therefore the start values with every creep that a fit starts from are tried. Each parameter
-    gets the least informative of its estimates, and the messages describe the start with the
-    largest determinant of the covariance.
+    therefore the start values are tried with each creep in `CREEPS`, from which a fit starts. Each
+    parameter gets the least informative of its estimates, and the messages describe the start with
+    the largest determinant of the covariance.
     """
     space, w = problem.space, problem.windows
     log_v, keep, volt = scatter(problem), np.ones(len(w)), w.has_voltage
@@ -231,7 +233,8 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
     most = -np.inf
     starts = (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS))
     covariances = [problem.laplace(z, log_v, keep) for z in starts]
-    # The range of validity comes after the covariances, since it uses their compiled functions.
+    # The range of validity is computed after the covariances, since it uses the functions that were
+    # compiled for them.
     robot = space.tree(space.start)
     validity = curves_of.validity(task.dataset, robot, problem.batch)
     where = w.has_current, volt, validity, robot.geometry.determines_twist
@@ -247,7 +250,10 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
 
 
 def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
-    """Replace each kept estimate by the found one of the same path if that is less informative."""
+    """Replace each kept estimate by the found one of the same path if that one is less informative.
+
+    An estimate is less informative if its verdict is worse or, at equal verdicts, its ratio larger.
+    """
     order = ("identified", "weak", "not_identified")
 
     def promise(e: Estimate) -> tuple[int, float]:

@@ -46,7 +46,7 @@ def compare(
         config_path: the config.
         data: folder of the logs.
         out: folder to write to.
-        questions: kinds of folds, some of `slipid.predict.folds.QUESTIONS`.
+        questions: kinds of folds, each one of `slipid.predict.folds.QUESTIONS`.
         report: reporter of the progress.
 
     Raises:
@@ -122,12 +122,12 @@ def _folds(
     kept: Checkpoint,
     report: Reporter,
 ) -> tuple[dict[str, list[Content]], Robot]:
-    """Return the results of all folds by the kind of fold, and the robot fitted to all runs.
+    """Return the results of all folds, keyed by the kind of fold, and the robot fitted to all runs.
 
     Args:
         task: the fit task.
         problem: likelihood of all runs.
-        folds_by_question: fold of each run, by the kind of fold.
+        folds_by_question: index of each run's fold, keyed by the kind of fold.
         kept: checkpoint of finished folds.
         report: reporter of the progress.
     """
@@ -196,7 +196,8 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Valida
         report.line(sentence)
     if again := len(dataset) - fit.new_runs(dataset):
         report.line(
-            f"{again} of {len(dataset)} runs were fitted: their errors say little about new runs"
+            f"{again} of {len(dataset)} runs were used in the fit: their errors say little about "
+            "new runs"
         )
     report.stage("predicting")
     try:

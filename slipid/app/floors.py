@@ -55,8 +55,8 @@ def floors_under(
         out: folder that `slipid identify` wrote.
         map_file: map of the floor, in the frame of the poses.
         data: folder of the logs.
-        glob: glob of logs below the data folder; None for those that the config of the fit names
-            with a map.
+        glob: glob of logs below the data folder; None to use the `[[logs]]` sections with a map in
+            the config of the fit.
         report: reporter of the progress.
 
     Raises:
@@ -74,7 +74,8 @@ def floors_under(
         ]
     if not sections:
         raise DataError(
-            f"{out / 'config.toml'}: no [[logs]] with a map; expected --logs GLOB for runs over it"
+            f"{out / 'config.toml'}: no [[logs]] with a map; expected the option --logs GLOB with "
+            "runs over the map"
         )
     report.stage("reading logs")
     runs, skipped = read_dataset(config, sections, data, report)

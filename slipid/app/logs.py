@@ -1,4 +1,4 @@
-"""Reading of the logs that a config names as one set of runs; also the files in the package."""
+"""Reading of the logs that a config names, as one set of runs; also access to packaged files."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -59,7 +59,8 @@ def read_dataset(
     if short:
         skipped.append(f"skipped: {short} runs with fewer rows than the min_rows of their section")
     if not logs:
-        raise DataError("\n".join([*aside, *skipped]) or f"{root}: no run in any file")
+        nothing = f"{root}: no run in any file of {config.path}; expected logs with a moving robot"
+        raise DataError("\n".join([*aside, *skipped]) or nothing)
     return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
 
 
@@ -78,7 +79,7 @@ def required_files(
 def files_of(
     config: Config, sections: Sequence[LogsSection], root: Path
 ) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
-    """Return the log sections that have files, with their files, and lines about the rest."""
+    """Return the log sections that have files, with their files; also a line about each other."""
     found: list[tuple[LogsSection, list[Path]]] = []
     skipped: list[str] = []
     for section in sections:
@@ -145,7 +146,7 @@ RECORDED = Path(__file__).with_name("recorded.zip")
 def packaged_path(name: str) -> Path:
     """Return the path of a config, or of another file in its folder, that ships with slipid."""
     package = Path(__file__).parents[1]
-    # The folder is beside the package in a clone of the repository, and inside an installed one.
+    # In a clone of the repository the folder is beside the package, in an installation inside it.
     for folder in (package / "configs", package.parent / "configs"):
         if (folder / name).is_file():
             return folder / name

@@ -1,9 +1,9 @@
 """Set-up of the fit task and of the likelihood from a config and a data folder.
 
-Priors of the load shares follow from scales under the wheels, or from masses at known positions: a
-mass m at position p adds weights n_i on the wheels at p_i, with sum n_i = m and sum n_i p_i = m p.
-For three wheels the solution is unique; for more wheels, the minimum-norm solution is taken, as if
-all wheels were equally stiff.
+Priors of the load shares follow from readings of scales under the wheels, or from masses at known
+positions: a mass m at position p adds weights n_i on the wheels at p_i, with sum n_i = m and sum
+n_i p_i = m p. For three wheels the solution is unique; for more wheels, the minimum-norm solution
+is used, as if all wheels were equally stiff.
 """
 
 import fnmatch
@@ -63,7 +63,7 @@ def _wheel_weights(
     """Return the weight on each wheel [kg] and its variance [kg^2] in a load set-up.
 
     Args:
-        weights: known weights by load set-up.
+        weights: known weights, keyed by the name of the load set-up.
         name: name of the set-up.
         shape: geometry of the robot.
         above: names of the set-ups that refer to this one, to detect circles.
@@ -134,19 +134,19 @@ class FitTask:
         return hash_of((log.name, log.sha256) for log in self.logs)
 
     def problem(self, near: Robot | None = None) -> Problem:
-        """Return the likelihood of the runs on one floor each.
+        """Return the likelihood of the runs that stay on one floor each.
 
-        If a robot `near` the optimum is known, windows are cut for it.
+        `near` is a robot close to the optimum, or None; windows are cut for `cutting_robot(near)`.
         """
         return Problem(self.windows(self.cutting_robot(near)), self.robot, list(self.choices))
 
     def cutting_robot(self, near: Robot | None) -> Robot:
         """Return the robot for whose wheel radius and lag windows are cut.
 
-        It is the robot at the start of a fit. If a robot `near` an optimum is given and the two
-        lags differ by more than `RECUT_LAG_S`, the result has the lag of `near`, because the wheel
-        angle turned in a window is linear in the lag only near the lag for which the window was
-        cut.
+        The result is the robot at the start of a fit. If a robot `near` an optimum is given whose
+        lag differs from that of the start by more than `RECUT_LAG_S`, the result has the lag of
+        `near`, because the wheel angle turned in a window is linear in the lag only near the lag
+        for which the window was cut.
         """
         robot = Space(self.robot, self.choices).template
         if near is None or abs(float(near.camera.lag - robot.camera.lag)) <= RECUT_LAG_S:
@@ -179,9 +179,10 @@ class ConfigFitTask(FitTask):
 
 
 def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask:
-    """Return the fit task of a config, with the runs on one floor each that it names.
+    """Return the fit task of a config, after reading all its runs that stay on one floor each.
 
-    The bench file of its motor is read first, so that an error in it appears before logs are read.
+    The bench file of the motor, if the config names one, is read first, so that an error in this
+    file appears before logs are read.
     """
     bench_of(config)
     report.stage("reading logs")
@@ -231,8 +232,8 @@ def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
 def _go_together(task: ConfigFitTask, data: Runs) -> None:
     """Raise `DataError` if runs that cross floors are inconsistent with the single-floor runs.
 
-    They are if a run is in both sets, has a load set-up that no single-floor run has, or has
-    another number of wheels.
+    They are inconsistent if a run is in both sets, has a load set-up that no single-floor run has,
+    or has another number of wheels.
     """
     names, first = {log.name for log in task.logs}, task.dataset.logs[0]
     for log in data.logs:
@@ -256,7 +257,8 @@ def fit_task(
 ) -> ConfigFitTask:
     """Return the fit task of a config with runs that were read already.
 
-    `skipped` has lines about what was not found or used.
+    `skipped` has a line about each log that was not found or not used. Lines about patterns and
+    weights that apply to no run are added to it.
     """
     shape = shape_of(config)
     logged = dataset.logs[0]
@@ -295,7 +297,7 @@ def fit_task(
 def lag_from_motion(dataset: Runs) -> list[Choice]:
     """Return a choice that frees the camera lag, with a prior at the lag found from the motion.
 
-    It is empty if the motion shows no clear lag, or one above `MOST_LAG`.
+    The list is empty if the motion shows no clear lag, or a lag whose magnitude exceeds `MOST_LAG`.
     """
     lag = pose_lag(dataset)
     if lag is None or abs(lag.seconds) > MOST_LAG:
@@ -363,7 +365,11 @@ def stated_sizes(robot: Robot, mass: float) -> list[Choice]:
 
 
 def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
-    """Return the config's choices for parameters, and lines about those that apply to no run."""
+    """Return the config's choices for parameters, and lines about them.
+
+    The lines name the parameters with a prior from the bench file, and choices that apply to no
+    run.
+    """
     paths, skipped = [e.path for e in entries(robot)], []
     choices = stated_sizes(robot, config.content.wheels.mass_kg or float(robot.body.mass))
     choices += lengths(config.content.fit.lengths_from, robot.geometry)

@@ -34,12 +34,13 @@ def sample(
 ) -> tuple[Posterior, Content]:
     """Return draws of the posterior of the fit in `out`, and the content of sample.json.
 
-    The draws, the content and, with new intervals, identified.json are written to `out`. An
-    interrupted chain resumes where it stopped.
+    The draws are written to `out` as posterior.nc, and the content as sample.json. The file
+    identified.json is replaced; it then has the intervals of the posterior. An interrupted chain
+    resumes where it stopped.
 
     Args:
         out: folder that `slipid identify` wrote.
-        data: folder of the logs; None for the folder from which they were fitted.
+        data: folder of the logs; None for the folder from which the fit read them.
         plan: size and seed of the chains.
         draws: number of draws kept from each ensemble.
         report: reporter of the progress.
@@ -70,7 +71,7 @@ def sample(
 
 
 def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
-    """Return the content of sample.json: settings, convergence, and diagnosis by coordinate."""
+    """Return the content of sample.json: settings, convergence, diagnosis of each coordinate."""
     d = posterior.diagnosis
     return {
         "schema": "slipid.sample/1",
@@ -104,7 +105,7 @@ def _log_folder(out: Path, data: Path | None) -> Path:
     """
     if data is not None:
         return data
-    run = read_json(out / "run.json", "what `slipid identify` keeps of a run")
+    run = read_json(out / "run.json", "the run.json that `slipid identify` writes")
     folder = Path(run["data"]["folder"])
     if not folder.is_dir():
         raise DataError(f"{folder}: the folder of the fitted logs is gone; expected --data DIR")
@@ -121,7 +122,7 @@ def _refuse_mixed(fit: Fit) -> None:
 
 
 def _refuse_other_logs(fit: Fit, task: ConfigFitTask) -> None:
-    """Raise `DataError` if the logs are not those of the fit; it names the first that differs."""
+    """Raise `DataError` about the first log that differs from the logs of the fit, if any does."""
     then, now = dict(fit.runs), {log.name: log.sha256 for log in task.dataset.logs}
     for name in [*then, *now]:
         if then.get(name) != now.get(name):

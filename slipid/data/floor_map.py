@@ -134,7 +134,8 @@ def patchwork(
 def four_zones(surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.2)) -> FloorMap:
     """Return the map of four surfaces that meet in a point.
 
-    By default this point is the centre of the rectangle that the robot drives in the 2021 paper.
+    By default this point is the centre of the rectangle that the robot drives in the 2021 paper
+    (see docs/theory.md).
 
     Args:
         surfaces: surfaces of the quarters with low x and high y, high x and high y, high x and low

@@ -1,7 +1,7 @@
 """Floor maps as polygons in a GeoJSON file, with coordinates in metres instead of degrees.
 
-The surface outside all polygons is unknown; in a floor map read from the file, it is that of the
-nearest polygon.
+The surface outside all polygons is unknown; when the file is read, every cell there gets the
+surface of the nearest polygon.
 """
 
 from dataclasses import dataclass
@@ -144,8 +144,8 @@ def read_polygons(path: Path) -> FloorMap:
     names = tuple(region.colours)
     surfaces = {feature.properties.surface for feature in given.features} | {region.base}
     if missing := sorted(surfaces - {*names}):
-        where = "the key 'colours' of its object 'slipid'"
-        raise bad_data(path, f"no colour of {', '.join(missing)}", f"it in {where}")
+        where = "the key 'colours' of the object 'slipid'"
+        raise bad_data(path, f"no colour of {', '.join(missing)}", f"every surface in {where}")
     rows = max(1, round((high_y - low_y) / region.cell_m))
     columns = max(1, round((high_x - low_x) / region.cell_m))
     if rows * columns > MOST_CELLS:

@@ -28,12 +28,12 @@ class Log:
         wheel_speed_command: commanded speed of each wheel [rad/s], or None.
         twist_command: commanded x [m/s], y [m/s] and yaw rate [rad/s], or None.
         current: current of each motor [A], or None.
-        current_fresh: False where a current repeats the last reading; None if every row has a new
-            one.
+        current_fresh: False where a current repeats the last reading; None if every row has new
+            currents.
         current_is_signed: False if the log has only magnitudes of currents.
         voltage: voltage across each motor [V], or None.
-        voltage_fresh: False where a voltage repeats the last reading; None if every row has a new
-            one.
+        voltage_fresh: False where a voltage repeats the last reading; None if every row has new
+            voltages.
         duty: duty cycle of each motor's bridge [1], or None.
         bus_voltage: supply voltage [V], or None.
         gyro: yaw rate [rad/s], or None.
@@ -44,7 +44,7 @@ class Log:
             their own; else None.
         surface: name of the surface, or None if it is unknown.
         load: name of the load set-up.
-        notes: repairs made by the reader, one sentence each.
+        notes: repairs made when the log was read, one sentence each.
     """
 
     name: str

@@ -25,7 +25,7 @@ class Runs:
     Attributes:
         logs: the runs; their arrays are views of the flat arrays below, but a run in which a stall
             was bridged keeps its own raw wheel angles.
-        offset: index of the first sample of each run, and finally the number of samples.
+        offset: index of the first sample of each run; the last element is the number of samples.
         time: time within the run [s] (sample,).
         wheel_angle: angle of each wheel [rad] (sample, wheel), linear across telemetry stalls.
         pose: x [m], y [m], heading [rad], in the scale of the log.
@@ -42,7 +42,7 @@ class Runs:
             or no command was logged.
         speed: commanded speed of each run [m/s]; nan if no command was logged.
         turn: commanded yaw rate of each run [rad/s]; nan if no command was logged.
-        aside: one line about each run that was left out because its pose jumps.
+        aside: one line about each run that was left out because its poses are unusable.
     """
 
     logs: tuple[Log, ...]
@@ -97,7 +97,7 @@ def collect(
         session: name of each run's session; within a session the camera's marker was not moved on
             the robot. By default the runs with the same surface, load set-up and commanded speed
             are one session, since the runs of an experiment are usually driven in that order.
-        aside: one line about each run that was left out because its pose jumps.
+        aside: one line about each run that was left out because its poses are unusable.
 
     Raises:
         DataError: there is no run, the numbers of wheels differ, or a run has no poses.

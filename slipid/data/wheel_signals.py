@@ -1,7 +1,7 @@
 """Functions on the signals of one run.
 
-They compute increments of motion, find the rows in which a slow sensor was read, interpolate across
-telemetry stalls, and detect the start of motion and a wrong order of the wheels.
+The functions compute increments of motion, find the rows in which a slow sensor was read,
+interpolate across telemetry stalls, and detect the start of motion and a wrong order of the wheels.
 """
 
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ STALL_STEPS = 3
 """In a telemetry stall, no wheel angle changes for at least this number of rows."""
 DOUBTFUL_MISFIT = 0.05
 """Another order of the wheels is considered only if the misfit of the declared order (see
-`swapped_order`) exceeds this [1]; speed-control errors cause a smaller misfit."""
+`swapped_order`) exceeds this value [1]; speed-control errors cause a smaller misfit."""
 LEAST_CHANGES = 8
 """Least number of changes of a sensor's value that suffices to estimate its refresh period."""
 LEAST_CHANGES_PER_RUN = 3
@@ -89,7 +89,8 @@ def read_anew(
 ) -> Bool[np.ndarray, " time"]:
     """Return whether a sensor with a refresh period [s] was read in each row.
 
-    It counts as read where its value changes, and once every period while the value stays constant.
+    The sensor counts as read where its value changes, and once every period while the value stays
+    constant.
     """
     out = np.zeros(len(time), dtype=bool)
     out[0] = True
@@ -182,9 +183,9 @@ def swapped_order(
 
     where i runs over the wheels and |.| is the norm over all steps. The misfit is computed from the
     sums of products of every pair of columns, so that trying all orders of six wheels is fast.
-    Steps may be any measure of wheel motion, such as the angle turned [rad], the same in both
-    arrays. The result is None unless the misfit of the declared order exceeds `DOUBTFUL_MISFIT` and
-    another order is clearly better.
+    Both arrays have a row for each step, with the same measure of wheel motion, such as the angle
+    turned [rad]. An order is returned if the misfit of the declared order exceeds
+    `DOUBTFUL_MISFIT`, and another order is clearly better; else the result is None.
     """
     products = measured.T @ reference
     norm, reference_norm = float(np.sum(measured**2)), float(np.sum(reference**2))

@@ -119,10 +119,10 @@ def windows(
 def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
     """Return the variance of a single reading of each ammeter in each run [A^2].
 
-    It uses second differences d_t = x_(t-1) - 2 x_t + x_(t+1), which have six times the variance of
-    white noise and suppress smooth signals: of the variance of a ripple with a period of n readings
-    only the fraction (2 - 2 cos(2 pi / n))^2 / 6 remains, 6 % at n = 8. The std of d is taken from
-    the quantile of |d| at 68 %, so that jumps have little weight.
+    The estimate uses second differences d_t = x_(t-1) - 2 x_t + x_(t+1). Their variance is six
+    times that of white noise, whereas smooth signals are suppressed: a ripple with a period of n
+    readings keeps only the fraction (2 - 2 cos(2 pi / n))^2 / 6 of its variance, which is 6 % at
+    n = 8. The std of d is estimated by the 68 % quantile of |d|, so that jumps have little weight.
 
     Limits: ripple with a shorter period, or aliased by slow sampling, counts as noise; repeated
     readings, or smoothing in the motor driver, make the estimate too small; if the resolution of
@@ -251,10 +251,11 @@ def _mean(
     Each row is weighted by the time from the middle between it and the previous row to the middle
     between it and the next row. (A plain mean over the rows in a window would be biased, because
     its first row comes after the edge: while a robot speeds up, mean voltages would be too high.)
-    Between the readings of a slow meter the signal is taken as linear. If it really jumped from one
-    reading to the next at an unknown time in between, the mean over that time has an error whose
-    std is the difference of the two readings over sqrt(12); the returned variance is due to these
-    errors. Rows of telemetry stalls are left out, except in windows that have no other rows.
+    Between the readings of a slow meter the signal is assumed to be linear. If it really jumped
+    from one reading to the next at an unknown time in between, the mean over that time has an error
+    whose std is the difference of the two readings divided by sqrt(12); the returned variance is
+    due to these errors. Rows of telemetry stalls are left out, except in windows that have no other
+    rows.
 
     Args:
         time: times of the rows [s].

@@ -1,4 +1,4 @@
-"""Texts of log files, with slipid's own columns or with those of the published Robotino logs."""
+"""Text of log files, with slipid's own columns or with those of the published Robotino logs."""
 
 from collections.abc import Sequence
 from io import StringIO
@@ -18,6 +18,7 @@ OPTIONAL = {
 }
 """Unit and number format of the optional channels of a log."""
 _IMAGE = (1920, 1080)
+"""Width and height of the camera's image [pixel]."""
 
 
 def own_columns(wheels: int, more: Sequence[str]) -> Content:

@@ -301,7 +301,7 @@ def test_duty_and_bus_voltage_make_a_voltage(tmp_path):
     ("cells", "expected"),
     [
         ("0.25,-50e-2,24000", "row 2, column 'bus': bus_voltage of 2.4e+04 V"),
-        ("50,-50e-2,24", "row 2, column 'd1': duty of 50 (a share of 1)"),
+        ("50,-50e-2,24", "row 2, column 'd1': duty of 50 (1 is the full supply voltage)"),
     ],
 )
 def test_what_makes_a_voltage_is_refused_by_its_own_name(tmp_path, cells, expected):

@@ -280,7 +280,7 @@ def test_validate_predicts_unseen_runs(small, tmp_path):
     # encoders are off by a quarter on this floor
     assert models["identified"]["endpoint_error_mean"] < 0.05
     assert models["encoder"]["endpoint_error_mean"] > 0.15
-    assert "were fitted" not in result.stderr
+    assert "were used in the fit" not in result.stderr
 
 
 @pytest.mark.slow
@@ -288,7 +288,7 @@ def test_validate_reports_fitted_runs_and_unknown_floors(small, tmp_path):
     folder, _ = small
     result = invoke("validate", folder / "out", "--data", folder / "logs")
     assert result.exit_code == 0
-    assert "12 of 12 runs were fitted" in result.stderr
+    assert "12 of 12 runs were used in the fit" in result.stderr
     other = tmp_path / "as_built/ice/run000.csv"
     other.parent.mkdir(parents=True)
     other.write_bytes((folder / "logs/as_built/soft/run000.csv").read_bytes())

@@ -63,7 +63,7 @@ def test_yes_takes_defaults_and_lists_them(tmp_path, drive):
     result = invoke("new", "--out", out, "--drive", drive, "--yes")
     assert result.exit_code == 0, result.stderr
     assert read_config(out).content.robot.drive == drive
-    assert "? wheel_radius_m: taken by default" in result.stdout
+    assert "? wheel_radius_m: default value" in result.stdout
 
 
 def test_a_log_is_looked_into(tmp_path):

@@ -257,7 +257,7 @@ def test_cells_are_covered_by_their_middles():
         (('"cell_m": 0.1', '"cell": 0.1'), r"slipid\.cell: no such key, did you mean cell_m"),
         (
             ('"surface": "gray"', '"surface": "sand"'),
-            "no colour of sand; expected it in the key 'colours'",
+            "no colour of sand; expected every surface in the key 'colours'",
         ),
         (('"confidence": 2.5', '"confidence": NaN'), r"confidence: nan; expected"),
         (('"colour": "#808080"', '"colour": "gray"'), r"properties\.colour: 'gray'; expected"),

@@ -52,7 +52,7 @@ class _TopicChannel:
     unit: str = ""
 
     def line(self) -> ConfigLine:
-        """Return the line of the config for the channel, commented out for an effort."""
+        """Return the config line of the channel; it is commented out if the field is an effort."""
         topic = self.topic
         inside = f"topic = {toml(topic.name)}"
         if self.field:
@@ -68,7 +68,7 @@ class _TopicChannel:
 def bags_in(path: Path) -> list[Path]:
     """Return the bags at or below a path, as a config names them.
 
-    A bag that is a rosbag2 folder is named by its metadata.yaml; other files in it are not listed.
+    A rosbag2 folder is named by its metadata.yaml; other files in the folder are not listed.
     """
     if path.is_file():
         return [path] if path.suffix in SUFFIXES or path.name == _METADATA else []
@@ -78,7 +78,7 @@ def bags_in(path: Path) -> list[Path]:
 
 
 def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> ConfigDraft:
-    """Return the proposed config for bags, which is made from the first bag.
+    """Return a config for bags, proposed from the topics of the first bag.
 
     Args:
         bags: the bags, from `bags_in`.
@@ -144,7 +144,7 @@ def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
         return names, f"which of the joints are wheels, in which order? {', '.join(names)}"
     ordered = tuple(sorted(wheels, key=lambda name: rank(labels[name].label)))
     others = [name for name in names if name not in wheels]
-    doubt = f"joints that are not taken for wheels: {', '.join(others)}" if others else ""
+    doubt = f"are these joints no wheels: {', '.join(others)}?" if others else ""
     return ordered, doubt
 
 
@@ -187,8 +187,8 @@ def _by_field_names(
             taken.add(meaning.channel)
             unit = meaning.unit or CHANNELS[meaning.channel]
             ask = (
-                f"taken by the name of the field: is it the {meaning.channel} in {unit}, in the "
-                "order of the joints?"
+                f"guessed from the name of the field: is it the {meaning.channel} in {unit}, in "
+                "the order of the joints?"
             )
             yield _TopicChannel(meaning.channel, topic, wheels, ask, field.path, unit)
 

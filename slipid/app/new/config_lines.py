@@ -116,8 +116,8 @@ _ARROWS = "↑↖←↙↓↘→↗"
 _LINES = r"|\-/"
 """Characters for lines along the directions ahead (up), ahead left, left and back left."""
 _ROWS, _COLUMNS, _LEAST = 5, 13, 3
-"""Size of the drawing: largest number of rows ahead of the middle, width in columns on either side
-of it, and least number of rows ahead of it."""
+"""Size of the drawing, counted from the robot's middle: largest number of rows to the foremost or
+rearmost wheel, number of columns to either side, and least number of rows ahead."""
 _MARGIN = 12
 """Number of columns beyond the wheels, for the y axis and the labels."""
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
@@ -127,11 +127,11 @@ LABEL_WIDTH = 3
 
 
 def drawing(robot: Geometry) -> str:
-    """Return a drawing of the robot from above, x up and y left, and a line about every wheel.
+    """Return a text drawing of the robot seen from above, followed by a line about every wheel.
 
-    A wheel is drawn as its number in the order of the log columns, an arrow in the direction in
-    which it rolls at a positive speed, and the letter of the motor that it shares with other
-    wheels.
+    The x axis (ahead) points up and the y axis to the left. A wheel is drawn as its number in the
+    order of the log columns, an arrow in the direction in which it rolls at a positive speed, and
+    the letter of the motor that it shares with other wheels.
     """
     lines = [
         "seen from above, arrows: direction of a positive wheel speed",
@@ -151,10 +151,11 @@ def direction(degrees: float) -> str:
 
 
 def _grid_wheels(robot: Geometry) -> dict[tuple[int, int], str]:
-    """Return the label of each wheel by its row and column, moved down where they would overlap.
+    """Return the label of each wheel, keyed by its row and column in the drawing.
 
-    Rows count down and columns to the right, from the middle. A character is about twice as high
-    as wide, so one row is as far as two columns.
+    Rows are counted downwards and columns to the right, from the robot's middle. A character is
+    about twice as high as wide, so one row is as far as two columns. A label that would overlap
+    another one is moved down.
     """
     place = np.asarray(robot.place) * float(robot.base_radius)
     step = max(np.abs(place[:, 0]).max() / _ROWS, np.abs(place[:, 1]).max() / (_COLUMNS / 2), 1e-9)
@@ -177,7 +178,7 @@ def _letter(robot: Geometry, wheel: int) -> str:
 
 
 def _picture(labels: dict[tuple[int, int], str]) -> list[str]:
-    """Return the drawing of the axes and of the wheels' labels, given by row and column."""
+    """Return the lines of a drawing with the axes and with labels, keyed by row and column."""
     rows, columns = zip(*labels, strict=True)
     top, bottom = min(-_LEAST, *rows) - 1, max(0, *rows)
     width = max(_COLUMNS, *map(abs, columns)) + _MARGIN
@@ -213,10 +214,10 @@ def _wheel_line(robot: Geometry, wheel: int) -> str:
 
 
 def _tilt(drive: float, roller: float) -> str:
-    """Return a text with a line that shows the tilt of a wheel's upper rollers, seen from above.
+    """Return a remark with a stroke that shows the tilt of a wheel's upper rollers from above.
 
-    It is empty for rollers that are not tilted. `drive` is the drive direction and `roller` the
-    roller angle [deg].
+    The stroke is one of `_LINES`; the remark is empty if the rollers are not tilted. `drive` is the
+    drive direction and `roller` the roller angle [deg].
     """
     if abs(roller % 180 - 90) < 1:
         return ""

@@ -26,16 +26,16 @@ _ANSWER_OF_KEY = {
     "drives": "shared",
 }
 """Name of the answer (in `RobotAnswers`) for a key of `[robot]`, where the names differ."""
-_ASK_MEASURED = "taken by default: measure it, or look it up"
-_ASK_PLACES = "taken by default: where do the wheels stand, in the order of the columns?"
+_ASK_MEASURED = "default value: measure it, or look it up"
+_ASK_PLACES = "default value: where do the wheels stand, in the order of the columns?"
 _QUESTIONS = {
     "drive": "which drive is it: omni, mecanum, skid, differential or general?",
     "wheel_azimuths_deg": _ASK_PLACES,
     "wheel_places_m": _ASK_PLACES,
-    "drive_directions_deg": "taken by default: which way does each wheel roll?",
-    "roller_angles_deg": "taken by default: do the wheels have rollers, and how are they tilted?",
-    "gear_ratio": "taken by default: is there a gear, and are speeds and ticks of the motor?",
-    "mass_kg": "taken by default: weigh the robot",
+    "drive_directions_deg": "default value: which way does each wheel roll?",
+    "roller_angles_deg": "default value: do the wheels have rollers, and how are they tilted?",
+    "gear_ratio": "default value: is there a gear, and are speeds and ticks those of the motor?",
+    "mass_kg": "default value: weigh the robot",
     "wheel_radius_m": _ASK_MEASURED,
 }
 _DATASHEET = (
@@ -52,7 +52,8 @@ _FIT = ConfigBlock(
         'lengths_from = "poses"',
     ),
 )
-"""Table `[fit]` as a comment, which asks whether poses are in true metres: no log shows it."""
+"""Table `[fit]` as a comment, which asks whether poses are in true metres, since no log shows this.
+"""
 
 
 def _head(draft: ConfigDraft, name: str) -> tuple[str, ...]:
@@ -71,7 +72,7 @@ def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock
     given = robot.model_dump(exclude_none=True)
     if isinstance(robot, OmniDrive) and robot.roller_angle_deg == 90.0:
         del given["roller_angle_deg"]  # the default: ordinary omni wheels need no line for it
-    # The keys of the type of drive come first, those that all robots have after them.
+    # The keys of the type of drive come first; the keys that all robots have come after them.
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
     own = (key for key in given if key not in ("drive", *common))
     lines = []

@@ -152,7 +152,7 @@ def template_draft(answers: RobotAnswers) -> ConfigDraft:
 
 
 def _settings(answers: RobotAnswers) -> tuple[ConfigLine, ...]:
-    ask = "taken by default: look it up, of the motor shaft with all edges"
+    ask = "default value: look it up, for one turn of the motor shaft, with all edges counted"
     ask = ask if "ticks_per_revolution" in answers.defaults else ""
     ticks = (
         layout_line("ticks_per_revolution", answers.ticks_per_revolution, ask),

@@ -26,7 +26,7 @@ _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
 """Labels of wheels in the order in which the types of drive count wheels."""
 _QUATERNION = ("x", "y", "z", "w")
 _LEAST_TICKS = 50
-"""Magnitude above which whole numbers of a position are taken for ticks."""
+"""Magnitude above which whole numbers of a position are assumed to be ticks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def channels_in(numbers: TableNumbers) -> Channels:
     wheels = [format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
     notes = []
     if wheels:
-        odometry = "odometry is no measured pose, it comes from the wheels"
+        odometry = "odometry is not a measured pose, since it is computed from the wheels"
         notes.append(f"{', '.join(wheels)}: {odometry}")
     if also:
         notes.append(f"not used, a second column: {', '.join(also)}")
@@ -151,9 +151,10 @@ def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
 
 
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
-    """Return the channels whose wheels match those of the motion, and lines about other channels.
+    """Return the channels that have the same wheels as the motion, and a line about each other one.
 
-    The motion is the channel from which the turns of the wheels are computed.
+    The motion is the channel from which the turns of the wheels are computed. Channels of the whole
+    robot are kept.
     """
     turns = [one for name in TURNS for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
@@ -199,7 +200,7 @@ def unnamed_channels(numbers: TableNumbers) -> Channels:
 
     def put(channel: str, *at: int) -> None:
         labels = tuple(str(k + 1) for k in range(len(at)))
-        doubt = (f"taken for {channel} by its numbers: is it?",)
+        doubt = (f"guessed from the numbers: is it {channel}?",)
         found.append(FileChannel(channel, at, labels, values[:, at], "", doubt))
 
     if time is not None:
@@ -344,8 +345,8 @@ def folder_per_run(kind: FileKind) -> bool:
 def matching_presets(kind: FileKind) -> tuple[str | None, list[str]]:
     """Return the preset that is certainly right for a kind of files, or None, and possible presets.
 
-    All presets can read the first files of the kind. The certain preset has so many column names
-    that they cannot match by chance; the possible presets have fewer.
+    All these presets can read one of the first files of the kind. The certain preset has so many
+    column names that they cannot match by chance; the possible presets have fewer.
     """
     fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
     fits = [name for name in fits if _reads(kind, PRESETS[name])]

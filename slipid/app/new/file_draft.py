@@ -79,7 +79,10 @@ def file_draft(
 
 
 def _units_row(one: FileStudy) -> int:
-    """Return the row of units, which the reader checks; 0 if a used column has no unit in it."""
+    """Return the row of units for the layout; 0 if there is none, or if a used column has no unit.
+
+    When logs are read, the units in this row are checked against the layout.
+    """
     used = [at for found in one.found for at in found.columns]
     return one.format.units_row if all(one.format.units[at] for at in used) else 0
 
@@ -87,7 +90,8 @@ def _units_row(one: FileStudy) -> int:
 def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
     """Return the lines of the layout about the times of rows.
 
-    They are about new runs in the file, repeated times, gaps, or the period if there is no time.
+    The lines are about new runs in the file, repeated times and gaps; or only about the period of
+    the rows, if the file has no time.
     """
     if one.clock is None:
         ask = "no column of time: how long is a row [s]?"
@@ -132,7 +136,7 @@ def _layout_settings(run: RunStudy, robot: RobotAnswers) -> list[ConfigLine]:
 def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
     """Return a remark about the ticks per turn that the reported speeds imply.
 
-    It is empty if the main file does not have both ticks and speeds.
+    The remark is empty if the main file has no speeds that can be compared with the ticks.
     """
     speed = run.main.find(*reversed(SPEEDS))
     if speed is None or not speed.unit or run.main.clock is None:
@@ -157,7 +161,7 @@ def radius_hint(run: RunStudy, robot: RobotAnswers) -> dict[str, str]:
     radius = ratio / factor(unit, "rad/s")
     if not RADII[0] <= radius <= RADII[1]:
         return {}
-    ask = f"taken by default: measure it; by the poses it is about {radius:.2g}"
+    ask = f"default value: measure it; according to the poses it is about {radius:.2g}"
     return {"wheel_radius_m": ask}
 
 
@@ -196,7 +200,7 @@ def _unusable(found: FileChannel, run: RunStudy) -> dict[str, str] | None:
 
 
 def unit_of(one: FileStudy, found: FileChannel, run: RunStudy, robot: RobotAnswers) -> UnitGuess:
-    """Return a guess of the unit of a channel, whose name has no unit."""
+    """Return a guess of the unit of a channel whose columns do not name one."""
     channel = found.channel
     most = float(np.nanmax(np.abs(found.values)))
     if channel == "time":
@@ -240,7 +244,7 @@ def _pose_heading_range(run: RunStudy) -> float:
 def _heading_range(run: RunStudy) -> float:
     """Return the range of the heading, integrated from a run's gyro or commands [rad].
 
-    It is 0 without them.
+    The range is 0 if the run has neither gyro nor commands.
     """
     for one in run.all:
         rate = one.find("gyro", "twist_command_yaw")

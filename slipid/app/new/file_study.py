@@ -21,9 +21,9 @@ from slipid.data.wheel_signals import refresh_period
 
 PIXELS = ("pixel", "pixels", "pix", "px")
 _ALIGNED_DRIVES = 2
-"""Number of drives up to which all wheels are taken to point ahead."""
+"""Largest number of drives for which all wheels are assumed to point ahead."""
 _SPARSE = 0.02
-"""Share of empty cells above which a channel is slower than the rows of the file [1]."""
+"""Fraction of empty cells above which a channel is slower than the rows of the file [1]."""
 CURRENTS = ("current", "motor_torque", "wheel_torque")
 SPEEDS = ("wheel_speed", "motor_speed")
 ANGLES = ("wheel_angle", "motor_angle")
@@ -78,7 +78,7 @@ class FileStudy:
         """Return the study without the channels in `names`, which come from another file."""
         kept = [one for one in self.found if one.channel not in names]
         again = sorted(one.channel for one in self.found if one.channel in names)
-        note = f"Also here, but taken from the other file: {', '.join(again)}."
+        note = f"Also here, but read from the other file: {', '.join(again)}."
         return replace(self, found=kept, notes=[*self.notes, note] if again else self.notes)
 
 
@@ -125,7 +125,7 @@ def pose_path(
 ) -> tuple[UnitGuess, Float[np.ndarray, "3 pose"] | None]:
     """Return the unit of the positions in a file, and the time [s], x and y [m] of each pose.
 
-    The latter are None if the file has no pose or no time, or if positions are in pixels.
+    Times and positions are None if the file has no pose or no time, or if positions are in pixels.
     """
     if one is None or not one.has_pose:
         return UnitGuess("m"), None
@@ -147,7 +147,8 @@ def pose_path(
 def ticks_are_increments(found: FileChannel, run: "RunStudy") -> bool | None:
     """Return whether ticks are increments since the previous row; None if it is not clear.
 
-    The path length by the pose is proportional to increments, else to the changes of the ticks.
+    If the ticks are increments, the distance that the pose moves in a row is proportional to the
+    ticks in the row; else it is proportional to the change of the ticks from the previous row.
     """
     values, path, time = np.nan_to_num(found.values), run.path, run.main.time
     of_rows = np.abs(values).sum(axis=1)[1:]
@@ -182,8 +183,8 @@ def pose_over_wheel_speed(
 ) -> float | None:
     """Return the ratio of body speed [m/s] to wheel speed [unit of the file] while wheels turn.
 
-    If wheel speeds are in rad/s and all wheels point ahead, it is the wheel radius [m]; for other
-    robots it is close to the radius. The result is None if poses or wheel speeds are missing.
+    If wheel speeds are in rad/s and all wheels point ahead, the ratio is the wheel radius [m]; for
+    other robots it is close to the radius. The result is None if poses or wheel speeds are missing.
     """
     if path is None or one.clock is None:
         return None
@@ -219,7 +220,8 @@ def has_sign(current: FileChannel, speed: FileChannel | None) -> bool | None:
 def has_magnitudes(current: FileChannel, speed: FileChannel | None) -> bool:
     """Return whether currents are positive while wheels drive backwards, as magnitudes are.
 
-    It is False if currents and speeds come from files with different rows, which do not show it.
+    The result is False if currents and speeds come from files with different rows, since they
+    cannot be compared then.
     """
     if speed is None or speed.values.shape != current.values.shape:
         return False
@@ -296,7 +298,7 @@ class RunStudy:
 
     @property
     def runs(self) -> tuple["RunStudy", ...]:
-        """Return this run and the others."""
+        """Return this run and the runs in `others`."""
         return (self, *self.others)
 
     @cached_property

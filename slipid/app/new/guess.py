@@ -96,7 +96,7 @@ def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
 def _two_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
     """Return answers with wheels placed in a left and a right row, as a first guess.
 
-    If the number is odd, the last wheel is at the back in the middle.
+    If the number of wheels is odd, the last wheel is at the back in the middle.
     """
     pairs = wheels // 2
     places = [
@@ -119,13 +119,13 @@ _MORE_RUNS = 4
 
 @dataclass(frozen=True, eq=False)
 class SortedFiles:
-    """All files that were found, sorted.
+    """All files that were found, sorted into published formats and other runs.
 
     Attributes:
         root: folder of the files.
         presets: kinds of files in a published format, each with the name of its preset.
-        groups: runs made of the other kinds.
-        hints: comments about published formats that may fit.
+        groups: studies of the runs made of the other kinds of files.
+        hints: comments about published formats that may be those of the files.
         sentences: lines about files that were found or left out.
         paths: every file, including files that are left out or are not logs.
     """
@@ -141,7 +141,7 @@ class SortedFiles:
 def sort_files(path: Path) -> SortedFiles:
     """Return the log files at a path, sorted.
 
-    If the path is a file without wheels or pose, files beside it are taken into account.
+    If the path is a file without wheels or pose, other files in its folder are added.
     """
     formats, no_logs = formats_below(path) if path.is_dir() else ([format_of(path)], {})
     presets, others, hints = [], [], []
@@ -187,7 +187,7 @@ def _siblings(path: Path, kind: FileKind) -> list[RunStudy]:
 
 
 def _run_files(kinds: list[RunStudy]) -> tuple[list[RunStudy], list[str]]:
-    """Return the runs of each kind of files with wheels, and lines about files of no run.
+    """Return the runs of each kind of files with wheels, and lines about files outside all runs.
 
     Files of other kinds beside the file with the wheels are added to the run.
     """

@@ -116,7 +116,7 @@ def _name(number: int) -> str:
 
 
 def _logs(found: SortedFiles) -> list[LogsDraft]:
-    """Return a log section for each glob; those without wheels or a pose are commented out."""
+    """Return a log section for each glob; sections without wheels or a pose are commented out."""
     named = [*found.presets, *((group.kind, _name(k)) for k, group in enumerate(found.groups))]
     whole = {
         name
@@ -135,7 +135,8 @@ def _logs(found: SortedFiles) -> list[LogsDraft]:
                 one = replace(one, question=_FLOOR.format(glob))
             out.append(one)
     if all(one.commented_out for one in out):
-        # A config must have at least one section; its layout asks for what is missing.
+        # A config must have at least one section, so the comment signs are removed; the layouts ask
+        # for what is missing.
         return [replace(one, commented_out=False, above=()) for one in out]
     return sorted(out, key=lambda one: one.commented_out)
 
@@ -183,11 +184,11 @@ def _bags_checked(draft: ConfigDraft, first: Path) -> ConfigDraft:
 
 
 def _problem(error: DataError) -> str:
-    return f"the reader says: {str(error).splitlines()[0].replace('robot.toml ', '')}"
+    return f"reading fails: {str(error).splitlines()[0].replace('robot.toml ', '')}"
 
 
 def _read(draft: ConfigDraft, name: str, path: Path) -> Sequence[Log]:
-    """Return the runs in a file, which is read with the draft's layout of the given name.
+    """Return the runs in a file, read with the layout `name` of the draft.
 
     There are no runs if no section of the draft uses the layout.
 

@@ -16,7 +16,8 @@ Its arguments are the question, the default, and a message about what was wrong 
 answer (empty at first).
 """
 RobotOptions = Mapping[str, str]
-"""Texts of the command-line options that describe a robot, by the names of `RobotAnswers`."""
+"""Values of the command-line options that describe a robot, keyed by attribute of `RobotAnswers`.
+"""
 _SECTION: TypeAdapter[Wheels] = TypeAdapter(Annotated[Wheels, Field(discriminator="drive")])
 
 
@@ -43,9 +44,9 @@ class RobotAnswers:
 
 
 def positive(text: str, _: RobotAnswers) -> float:
-    """Return a number above 0 from a text.
+    """Return the number above 0 in an answer.
 
-    Like all parsers below, it raises `ValueError` for any other text.
+    Like all parsers below, it raises `ValueError` for any other answer.
     """
     value = number(text)
     if not 0 < value < float("inf"):
@@ -54,7 +55,7 @@ def positive(text: str, _: RobotAnswers) -> float:
 
 
 def not_negative(text: str, _: RobotAnswers) -> float:
-    """Return a number that is 0 or more from a text."""
+    """Return the number, 0 or more, in an answer."""
     value = number(text)
     if not 0 <= value < float("inf"):
         raise ValueError("expected a number above 0, or 0 where there is none")
@@ -62,7 +63,7 @@ def not_negative(text: str, _: RobotAnswers) -> float:
 
 
 def number(text: str) -> float:
-    """Return the number in a text."""
+    """Return the number in a string."""
     try:
         return float(text.strip().replace("_", "?"))
     except ValueError:
@@ -71,14 +72,14 @@ def number(text: str) -> float:
 
 
 def count(text: str, _: RobotAnswers) -> int:
-    """Return a number of wheels, from 3 to 12, from a text."""
+    """Return the number of wheels, from 3 to 12, in an answer."""
     if not text.strip().isdecimal() or not 3 <= int(text) <= 12:
         raise ValueError("expected a whole number from 3 to 12")
     return int(text)
 
 
 def yes(text: str, _: RobotAnswers) -> bool:
-    """Return True for the text yes and False for no."""
+    """Return True for the answer yes and False for no."""
     word = text.strip().lower()
     if word not in ("y", "yes", "true", "n", "no", "false"):
         raise ValueError("expected yes or no")
@@ -90,7 +91,7 @@ def _parts(text: str) -> list[str]:
 
 
 def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
-    """Return an angle for every wheel [deg] from a text with numbers separated by commas.
+    """Return an angle for every wheel [deg] from an answer with numbers separated by commas.
 
     Semicolons are accepted as well.
     """
@@ -101,7 +102,7 @@ def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
 
 
 def places(text: str, _: RobotAnswers) -> tuple[tuple[float, ...], ...]:
-    """Return the centres x, y of two or more wheels [m] from a text such as `0.2,0.1; 0.2,-0.1`."""
+    """Return the centres x, y of two or more wheels [m], written like `0.2,0.1; 0.2,-0.1`."""
     found = tuple(tuple(number(c) for c in part.split(",")) for part in text.split(";"))
     if len(found) < 2 or any(len(place) != 2 for place in found):
         raise ValueError("expected x, y of each wheel, as in: 0.2, 0.1; 0.2, -0.1; -0.2, 0")
@@ -109,7 +110,7 @@ def places(text: str, _: RobotAnswers) -> tuple[tuple[float, ...], ...]:
 
 
 def rollers(text: str, answers: RobotAnswers) -> tuple[float | None, ...]:
-    """Return the roller angle of every wheel [deg] from a text such as `45,none`.
+    """Return the roller angle of every wheel [deg] from an answer such as `45,none`.
 
     The angle is None for a wheel without rollers.
     """
@@ -153,7 +154,7 @@ def _drive(text: str, _: RobotAnswers) -> str:
 
 
 def _even_azimuths(answers: RobotAnswers) -> str:
-    """Return the text of azimuths [deg] of evenly spread wheels, none of them straight ahead."""
+    """Return the azimuths [deg] of evenly spread wheels, none straight ahead, as an answer."""
     return ", ".join(f"{(k + 0.5) * 360 / answers.wheels:g}" for k in range(answers.wheels))
 
 
@@ -230,7 +231,7 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
 
     Args:
         options: answers given on the command line.
-        asker: function that asks the user, again after a wrong answer; None to take defaults.
+        asker: function that asks the user, again after a wrong answer; None to use the defaults.
         drive: default type of drive.
 
     Raises:
@@ -269,7 +270,8 @@ def _with_question(
 ) -> RobotAnswers:
     """Return the answers, with the answer to one more question added.
 
-    It comes from the options, else from the user (asked until it is valid), else from the default.
+    The answer comes from the options; else from `asker`, which is called until the answer is valid;
+    or it is the default if `asker` is None.
     """
 
     def read(text: str) -> RobotAnswers:

@@ -18,8 +18,8 @@ FAST = 12.0
 RADII = (0.012, 0.6)
 """Plausible range of wheel radii [m]."""
 _TURNED, _NEAR_TURN = 0.5, 5.0
-"""Range of the integrated turn rate above which it decides the unit of a heading [rad], and factor
-by which the range of the heading may then differ from it [1]."""
+"""If the heading integrated from a turn rate has a range above `_TURNED` [rad], it decides the unit
+of the logged heading, whose range may differ from it by a factor of at most `_NEAR_TURN` [1]."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def speed_of(
 ) -> float:
     """Return the 90 % quantile of the speed [unit of x and y per s].
 
-    Speeds are over steps of about one second, which average noise.
+    Speeds are means over steps of about one second, so that noise averages out.
     """
     there = ~(np.isnan(x) | np.isnan(y) | np.isnan(time))
     time, x, y = time[there], x[there], y[there]

@@ -115,7 +115,7 @@ class ParameterRow:
         unit: unit of its values.
         means: meaning of the parameter.
         start: declared start value.
-        prior: default prior, or that the parameter is not fitted.
+        prior: default prior, with a remark if the parameter is not fitted.
         here: choice for the parameter in the config; empty if there is none.
     """
 
@@ -253,7 +253,7 @@ def _list(inside: tuple[object, ...], limits: tuple[object, ...]) -> str:
     """Return a list type in words, with the number of its members if that is fixed."""
     members = [one for one in inside if one is not Ellipsis]
     element = in_words(members[0])
-    # With a validator that makes tuples, a single member may be written without a list.
+    # If a validator makes a tuple of a single value, this value may be written without a list.
     alone = any(type(limit).__name__ == "BeforeValidator" for limit in limits)
     counted = len(members) > 1 and Ellipsis not in inside
     many = f"{len(members)} " if counted else _length_text(limits)

@@ -39,7 +39,7 @@ def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
 
     Args:
         what: name of the part to return; None for the whole reference.
-        config: config whose robot's parameters are listed, or None.
+        config: config whose robot's parameters are listed; None for a robot with three omni wheels.
 
     Raises:
         DataError: no part has this name.

@@ -6,8 +6,8 @@ pose are regressed on the rotation of the wheels, or of the gyro (see `regressio
     s = t + offset + drift (t - middle)
 
 where t is the time of a pose on the clock of the poses and s the time on the robot's clock. The
-noise variances are estimated from the residuals, the stds of offset and drift from the disagreement
-between blocks of the run.
+noise variances are estimated from the residuals; the stds of offset and drift are estimated from
+the disagreement between blocks of the run.
 """
 
 from collections.abc import Iterable
@@ -42,7 +42,7 @@ replaces it if the motion contradicts it, for example because the declared frame
 BLOCKS = 10
 """Number of blocks of a run whose disagreement gives the stds of offset and drift."""
 MOST_ITERATIONS, NOISE_ITERATIONS = 20, 6
-"""Largest number of Gauss-Newton iterations, and number of the first ones that re-estimate the
+"""Largest number of Gauss-Newton iterations, and number of initial iterations that re-estimate the
 noise."""
 MOST_UNEXPLAINED = 0.5
 """Largest fraction of the motion that the regression at the best offset may leave unexplained
@@ -89,9 +89,9 @@ class Clock:
 def best_clock(pairs: Iterable[MotionPair]) -> Clock | None:
     """Return a run's clock offset and drift from the first motion pair that determines them well.
 
-    The std of the offset must be at most `SUFFICIENT_STD_S`; later pairs are not evaluated. If no
-    pair reaches this std, the result is that with the smallest std, or None if no pair determines
-    offset and drift.
+    A pair determines them well if the std of the offset is at most `SUFFICIENT_STD_S`; the pairs
+    after it are not evaluated. If no pair reaches this std, the result is the clock whose offset
+    has the smallest std, or None if no pair determines offset and drift.
     """
     found = []
     for pair in pairs:
@@ -114,7 +114,7 @@ def clock_of_poses(pair: MotionPair) -> Clock | None:
 
 
 def _searched(pair: MotionPair) -> float | None:
-    """Return the offset that explains the motion best, or None if it is not clearly the best."""
+    """Return the offset [s] that explains the motion best, or None if no offset is clearly best."""
     low = pair.time[0] + LEAST_OVERLAP_S - pair.pose_time[-1]
     high = pair.time[-1] - LEAST_OVERLAP_S - pair.pose_time[0]
     if not high > low:
@@ -128,8 +128,9 @@ def _searched(pair: MotionPair) -> float | None:
 def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | None:
     """Return the clock offset and drift from Gauss-Newton iterations.
 
-    The regression matrix B is profiled out. The result is None if the iterations do not converge,
-    or move by more than `FINE_HALF_WIDTH_S` from the given offset [s].
+    The matrix B of the regression (see module `regression`) is profiled out. The result is None if
+    the iterations do not converge, or if the offset leaves the given one [s] by more than
+    `FINE_HALF_WIDTH_S`.
     """
     middle = 0.5 * float(steps.first[0] + steps.last[-1])
     grid = offset + np.arange(-FINE_HALF_WIDTH_S, FINE_HALF_WIDTH_S + FINE_GRID_S, FINE_GRID_S)
@@ -194,10 +195,10 @@ def _clock(
 
 
 def _spread(near: Linearised, inverse: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2"]:
-    """Return the stds of offset and drift from the scores of blocks, by the sandwich formula.
+    """Return the stds of offset [s] and drift [1] from the gradients of blocks of the run.
 
-    The stds are at least the model-based ones, which follow from `inverse`, the inverse of the
-    normal matrix.
+    The sandwich formula is used. The stds are at least the model-based ones, which follow from
+    `inverse`, the inverse of the normal matrix.
     """
     blocks = np.array_split(np.arange(len(near.residual)), BLOCKS)
     scores = np.stack([np.einsum("kci,kc->i", near.slope[b], near.residual[b]) for b in blocks])

@@ -58,9 +58,10 @@ def pose_lag(data: Runs) -> PoseLag | None:
 
 
 def _searched(data: Runs) -> PoseLag | None:
-    """Return the lag from a coarse search and a fine search around its best lag.
+    """Return the lag from a coarse search, refined by a fine search around the best coarse lag.
 
-    The result is None if the best lag of the coarse search is not clear, or is at its limit.
+    The result is None if no coarse lag is clearly the best, or if the best one is at an end of the
+    searched range.
     """
     some = np.unique(np.linspace(0, len(data) - 1, MOST_RUNS).round().astype(int)).tolist()
     pairs = [pair for k in some if len((pair := _pair(data, k)).pose_time) > 1]
@@ -80,7 +81,7 @@ def _searched(data: Runs) -> PoseLag | None:
 
 
 def _pair(data: Runs, run: int) -> MotionPair:
-    """Return the motion pair of one run, extrapolated beyond the ends of its record."""
+    """Return the motion pair of one run; its motion is extrapolated beyond the ends of the run."""
     rows = data.rows(run)
     time, fresh = data.time[rows], data.fresh[rows]
     return MotionPair(

@@ -50,8 +50,8 @@ class MotionPair:
         pose: x, y [m], heading [rad] without wrap-around.
         source: sensor that measured `turned`.
         step: shortest duration of the compared pose increments [s].
-        collinear: relative threshold below which singular values of the turns are dropped [1], as
-            on a straight path, where the turns of all wheels are proportional.
+        collinear: relative threshold below which singular values of the turns are dropped [1]; on a
+            straight path the turns of all wheels are proportional, so that some are near zero.
         body_std: std of the delay between the body and `turned` [s].
         components: indices of the compared components: 0 ahead, 1 left, 2 heading.
         goes_on: True to extrapolate the motion beyond the ends of the record at the rates there;
@@ -97,7 +97,8 @@ class MotionPair:
     ) -> "MotionPair":
         """Return the motion pair of headings and a gyro [rad/s].
 
-        Scale and bias of the gyro are fitted, so time itself is the second column of `turned`.
+        Scale and bias of the gyro are fitted, so time, the integral of a constant bias, is the
+        second column of `turned`.
         """
         turned = np.column_stack([integral(time, gyro[:, None]), time])
         return cls(time, turned, pose_time, pose, "gyro", step=0.02, collinear=0.0, components=(2,))
@@ -227,9 +228,10 @@ class StepNoise:
     def whitened(
         self, rows: Float[np.ndarray, "step column"], joined: Bool[np.ndarray, " step"]
     ) -> Float[np.ndarray, "step column"]:
-        """Return the columns multiplied by the inverse Cholesky factor of the noise covariance.
+        """Return `rows` multiplied on the left by the inverse Cholesky factor of the covariance.
 
-        The covariance is 2 shared + separate on the diagonal, and -shared between joined steps.
+        The noise covariance is 2 shared + separate on the diagonal, and -shared between a step and
+        the previous one if `joined` is True, that is, if it begins where the previous one ended.
         """
         beside = np.where(joined[1:], -self.shared, 0.0)
         band = np.stack(

@@ -3,9 +3,9 @@
 The columns of commanded or reported speeds may be in another order than those of the encoders; this
 can be found from a single run. The channels of commanded and of reported speeds may be exchanged: a
 command precedes the motion and is constant between its changes. If the two channels are exchanged,
-the channel declared as the command changes later than the one declared as the measured speed, and
-in more rows. The sign and order of currents and voltages are found from the work of the motors,
-their units from the currents, voltages and power that are plausible for a robot.
+the declared command lags the declared measured speed, and changes in more rows than it. The sign
+and order of currents and voltages are found from the work of the motors; their units are found from
+the currents, voltages and power that are plausible for a robot.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,8 @@ from slipid.data.wheel_signals import integral, interpolate, swapped_order
 from slipid.support.errors import DataError
 
 MADE_REDUNDANT_BY = ("wheel_sign", "wheel_order", "command_sign", "command_order")
-"""Kinds of findings from poses that make a `wheel_columns` finding redundant."""
+"""Kinds of findings, found by comparison with the poses, that make a `wheel_columns` finding
+redundant."""
 CAUSED_BY_ORDER = ("wheel_scale", "wheel_speed_unit")
 """Kinds of findings that may only be consequences of a wrong order of columns. They are omitted if
 there is a `wheel_columns` finding; once its remedy is applied, the next check reports them if they
@@ -39,7 +40,8 @@ MOST_SHIFTS = 50
 MOST_ROWS = 20_000
 """Largest number of rows in which command and measured speed are compared."""
 LEAST_CORRELATION = 0.3
-"""Least correlation of command and measured speed, at the best lag, for a finding [1]."""
+"""Least correlation between the changes of command and measured speed, at the best lag, for a
+finding [1]."""
 CHANGE_RATIO = 1.5
 """Least ratio, for a finding, of the number of rows in which the declared command changes to that
 in which the declared measured speed changes [1]."""
@@ -135,7 +137,7 @@ def _changes(
         channel: integral of the wheel speed [rad].
         when: times of the rows [s].
         row: time between rows [s].
-        inside: True if the time from each row to the next lies within one run.
+        inside: for each row, True if the time from it to the next row lies within one run.
     """
     speed = (channel.at(when + row) - channel.at(when)) / row
     speed[~inside] = np.nan
@@ -143,9 +145,9 @@ def _changes(
 
 
 def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
-    """Return the correlation of changes of a command and of the speed `shift` rows later.
+    """Return the correlation between changes of the command and of the speed `shift` rows later.
 
-    `shift` may be negative.
+    A negative `shift` compares the command with the speed in earlier rows.
     """
     n = len(command) - abs(shift)
     first, second = (command[:n], speed[-n:]) if shift >= 0 else (command[-n:], speed[:n])
@@ -156,11 +158,12 @@ def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
 SHARE_IF_REVERSED = -0.25
 """Share of work (see `_share`) below which the sign of a current or voltage is wrong [1]."""
 SHARE_IF_ORDERED = 0.4
-"""Another order of the columns is a finding if every wheel's share of work exceeds this, and the
-sum of the shares exceeds the sum for the declared order with the best signs by as much [1]."""
+"""Another order of the columns is a finding if every wheel's share of work exceeds this value, and
+the sum of the shares exceeds the sum for the declared order with the best signs by more than this
+value [1]."""
 SHARE_OF_POWER = 0.1
-"""A current has the sign of the power, not of the torque, if its share of work is above this while
-wheels turn forwards and below its negative while they turn backwards [1]."""
+"""A current has the sign of the power, not of the torque, if its share of work is above this value
+while wheels turn forwards, and below minus this value while they turn backwards [1]."""
 MOST_A_PER_KG = 2.5
 """Slope of the largest plausible current of one motor, `MOST_A + MOST_A_PER_KG * mass` [A/kg];
 wheeled robots do not draw more for long."""
@@ -214,7 +217,8 @@ def electric(
     if not sizes and power is not None and not PLAUSIBLE_POWER[0] <= power <= PLAUSIBLE_POWER[1]:
         yield Finding(
             "current_unit",
-            f"the motors take {power:.3g} times the power of lifting the robot at its speed",
+            f"the motors take {power:.3g} times the power that lifting the robot at its speed "
+            f"would take; plausible: {PLAUSIBLE_POWER[0]:g} to {PLAUSIBLE_POWER[1]:g} times",
             "correct the unit of current (mA?) or voltage (mV?), or mass_kg in [robot]",
         )
     yield from sizes
@@ -279,7 +283,8 @@ def _sign_findings(
     yield Finding(
         f"{name}_sign",
         f"the {name} of {which} has the wrong sign: its product with the wheel speed, which "
-        f"should be mostly positive, sums to {share[turned].min():+.2f} of its magnitude",
+        f"should be mostly positive, sums to {share[turned].min():+.2f} of the sum of its "
+        "magnitudes",
         f"set scale = -1 for {'the channel' if every else 'its column of the channel'} {name}, "
         "if it is 1 (else reverse its sign)",
     )
@@ -290,10 +295,11 @@ def _other_order(
     speed: Float[np.ndarray, "row wheel"],
     declared: Float[np.ndarray, "row wheel"],
 ) -> tuple[int, ...] | None:
-    """Return the column of each wheel if another order explains more than other signs, else None.
+    """Return the column of each wheel if the columns are in another order than the wheels.
 
-    The result is also None if the columns match those of the encoders as declared, even if the
-    encoders are in a wrong order, because then the finding is about the encoders.
+    The result is None if other signs in the declared order explain the work as well. It is also
+    None if the columns match those of the encoders as declared, even if the encoders are in a wrong
+    order, because then the finding is about the encoders.
     """
     share, as_declared = (
         _share(np.nan_to_num(values[:, None] * one[:, :, None])) for one in (speed, declared)
@@ -306,7 +312,7 @@ def _other_order(
 
 
 def _share(work: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "*any"]:
-    """Return the share of work: the sum over steps, divided by the sum of the magnitudes [1].
+    """Return the share of work: the sum of `work` over steps, divided by the sum of |work| [1].
 
     It is 1 if all values are positive, -1 if all are negative, and 0 if all are zero.
     """
@@ -320,12 +326,12 @@ def _size(
     """Yield a finding if currents or voltages of driving motors are implausible.
 
     Args:
-        values: magnitudes, or None if not logged.
+        values: magnitudes of the current [A] or voltage [V], or None if it was not logged.
         name: name of the quantity.
         unit: unit of the values.
         low: smallest plausible value.
         high: largest plausible value.
-        channel: channel that the remedy names.
+        channel: name of the channel in the text of the remedy.
     """
     if values is None or not np.nanmax(values, initial=0.0) > 0:
         return

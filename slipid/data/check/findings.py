@@ -44,12 +44,12 @@ class Finding:
         return self.found + where + (f"; {self.remedy}" if self.remedy else "")
 
     def explained(self, how: str, others: Iterable["Finding"] = ()) -> "Finding":
-        """Return the finding with further text.
+        """Return the finding with its evidence and with alternative remedies.
 
         Args:
-            how: evidence, which follows the text of the finding.
+            how: evidence, which is appended to the description of what is wrong.
             others: alternative findings that explain the logs equally well, whose remedies are
-                added.
+                appended to the remedy.
         """
         more = "".join(f"; or, which explains these logs equally well: {o.remedy}" for o in others)
         return replace(self, found=f"{self.found}: {how}", remedy=f"{self.remedy}{more}")
@@ -60,7 +60,7 @@ class Finding:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return a text with the first `MOST_NAMED_RUNS` names and the number of further names."""
+    """Return a string with the first `MOST_NAMED_RUNS` names and the number of further names."""
     more = len(names) - MOST_NAMED_RUNS
     return ", ".join(names[:MOST_NAMED_RUNS]) + (f" and {more} more" if more > 0 else "")
 
@@ -87,8 +87,8 @@ _CONVENTION_SENTENCES = {
 def mistake_finding(mistake: Mistake) -> Finding:
     """Return the finding about a mistake in order, signs or axes, with at most two alternatives."""
     how = (
-        f"with this correction {mistake.after:.2f} of the motion remains unexplained, as declared "
-        f"{mistake.before:.2f}"
+        f"with this correction {mistake.after:.2f} of the motion remains unexplained, instead of "
+        f"{mistake.before:.2f} as declared"
     )
     return _candidate_finding(mistake.found).explained(
         how, map(_candidate_finding, mistake.others[:2])
@@ -144,7 +144,7 @@ def _sign_finding(kind: str, sign: Sequence[int], commanded: str) -> Finding:
 
 
 def _order_finding(kind: str, order: Sequence[int], columns: str) -> Finding:
-    """Return the finding that columns, described by the text `columns`, are in a wrong order."""
+    """Return the finding that columns are in a wrong order; `columns` describes them in words."""
     listed = ", ".join(str(k + 1) for k in order)
     return Finding(
         kind,
@@ -195,8 +195,8 @@ def cause_findings(
     if not fitting:
         found = Finding(
             "scales",
-            "the channels disagree about the motion, and no single wrong number explains it: "
-            f"{why}",
+            "the channels disagree about the motion, and neither one nor two wrong factors explain "
+            f"this: {why}",
             "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
         )
         return (found,) if why else ()
@@ -234,7 +234,7 @@ def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
     if cause.name == "time":
         unit = _unit_name(factor, {1e3: "ms", 1e6: "us", 1e9: "ns", 60.0: "s", 1e-3: "s"})
         remedy = f"set unit = '{unit}' for the channel time" if unit else "correct the unit of time"
-        found = f"time is in another unit, {size}"
+        found = f"time is in another unit than declared: it is {size}"
     elif cause.name == "pose_length":
         unit = _unit_name(factor, {1e3: "mm", 1e2: "cm", 1e-3: "m", 1e-2: "m"})
         to = f"set unit = '{unit}' for the channels" if unit else "correct the unit or scale of"
@@ -277,7 +277,7 @@ def _turns(factor: float, gear_ratio: float) -> str:
 
 
 def _unit_of_rate(factor: float) -> str:
-    """Return a text that names two confused units if a factor is their ratio, else an empty one."""
+    """Return a note on two confused units if the factor is their ratio, else an empty string."""
     names = {
         30 / pi: ": 'rpm' was taken for 'rad/s'",
         pi / 30: ": 'rad/s' was taken for 'rpm'",
@@ -285,11 +285,11 @@ def _unit_of_rate(factor: float) -> str:
         pi / 180: ": radians were taken for degrees",
         1 / (2 * pi): ": revolutions were taken for radians",
         2 * pi: ": radians were taken for revolutions",
-        1000.0: ": thousandths were taken for the whole",
+        1000.0: ": thousandths of the unit were taken for the whole unit",
     }
     return _unit_name(factor, names)
 
 
 def _unit_name(factor: float, names: Mapping[float, str]) -> str:
-    """Return the text in `names` whose key equals the factor within 0.1 %, else an empty text."""
+    """Return the value in `names` whose key equals the factor within 0.1 %, else ""."""
     return next((name for f, name in names.items() if isclose(f, factor, rel_tol=1e-3)), "")

@@ -1,9 +1,10 @@
 """Interpretations of the logs: order and signs of the wheels' columns, and the axes of the poses.
 
 The declared interpretation is compared with candidates, which differ from it by single mistakes.
-The misfit of an interpretation is a sum of unexplained fractions, each from 0 to 1. The fractions
-do not depend on the length of the motion, so that slip, which shortens it, does not count against
-the true interpretation:
+The misfit of an interpretation is a sum of unexplained fractions, each from 0 to 1. A fraction does
+not depend on the length of the motion, so that slip, which shortens the motion, does not count
+against the true interpretation. Each compared channel contributes the fraction of its motion that
+consists of:
 
     pose, and commanded twist   body increments along each axis that the wheels do not explain
     wheels                      rotations impossible for a rigid body (with more than three wheels)
@@ -91,8 +92,9 @@ class Evidence:
     """Sums of products from which the misfit of every interpretation is computed.
 
     Attributes:
-        rolling: turns of each wheel per body increment without slip, the Jacobian over the wheel
-            radius (wheel, 3) [rad/m]; the heading increment is an arc in metres at the base radius.
+        rolling: turns of each wheel per body increment without slip, that is, the Jacobian divided
+            by the wheel radius (wheel, 3) [rad/m]; the heading increment is an arc in metres at the
+            base radius.
         base: base radius [m].
         pose: products of the turns as declared with the body increments from the poses, for each
             convention without offset.
@@ -142,7 +144,7 @@ def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evide
 
 
 def _correlation_with_gyro(gyro: np.ndarray, body: np.ndarray, found: Products) -> float:
-    """Return the correlation of rotation by gyro and by heading, 0 if one of them is constant."""
+    """Return the correlation between the rotations of gyro and heading, 0 if either is constant."""
     turned = np.stack([gyro[found.known, 0], body[found.known, 2]])
     (gyro_square, both), (_, pose_square) = (turned * found.weight) @ turned.T
     size = np.sqrt(gyro_square * pose_square)

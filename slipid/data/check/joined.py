@@ -3,13 +3,13 @@
 The module also defines the conventions that logged poses may follow, with the body increments under
 each, and the sums of products of increments by which interpretations are compared.
 
-Steps with outliers get a low weight by a robust linear regression of the body increments on the
-wheels' turns:
+A robust linear regression of the body increments on the wheels' turns gives steps with outliers a
+low weight:
 
     body = K turn,    weight = (1 + (|residual| / s)^2)^-2,    s = 2 median |residual|
 
-It works for any interpretation, since the fitted matrix K absorbs order, signs, radius, azimuths
-and heading offset.
+The regression works for any interpretation, since the fitted matrix K absorbs order, signs, radius,
+azimuths and heading offset.
 """
 
 from collections.abc import Mapping
@@ -25,12 +25,12 @@ from slipid.data.wheel_signals import body_increments, integral, interpolate
 
 STEP_S = 0.4
 """Duration of a step [s]: long enough that jitter and rounding matter little, and short compared
-with the time of a turn."""
+with the duration of a turn of the robot."""
 INTEGRATED = ("wheel_speed", "wheel_speed_command", "twist_command", "gyro")
 """Channels of rates, which are compared by their integrals."""
 MOST_STEPS = 20_000
-"""Largest number of steps; if there were more, for example with time in a wrong unit, steps are
-made longer."""
+"""Largest number of steps; if there would be more, for example because time is in a wrong unit,
+steps are made longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,8 @@ class JoinedRuns:
         end: time at which each run ends (run,) [s].
         row: median time between rows of each run (run,) [s].
         angle: angle of each wheel [rad].
-        pose: x [m], y [m], heading [rad], only rows with a new pose.
+        pose: x [m], y [m], heading [rad] in the rows with a new pose, and in the first and last row
+            of each run.
         channels: channels that some run has, keyed by the name of their attribute in `Log`:
             integrals [rad, m] of the rates in `INTEGRATED`, and values of currents [A] and voltages
             [V].
@@ -179,9 +180,10 @@ def edges(data: JoinedRuns) -> StepEdges:
 
 
 def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements:
-    """Return the increments of the robot's channels over the steps, each moved back by `lag` [s].
+    """Return the increments of the robot's channels over the steps, moved to earlier by `lag` [s].
 
-    `lag` is the lag of the poses. Increments are nan where a moved step leaves its run.
+    `lag` is the lag of the poses behind the robot's sensors. Increments are nan where a moved step
+    leaves its run.
     """
     slack, before, after = data.row[at.run], at.before - lag, at.after - lag
     outside = (before < data.begin[at.run] - slack) | (after > data.end[at.run] + slack)
@@ -245,9 +247,9 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
     before, after = at.pose_before * flip, at.pose_after * flip
     before[:, 2] = _heading(before[:, 2], convention.heading)
     turned = _heading(after[:, 2], convention.heading) - before[:, 2]
-    # The reader removed the wrap-around of the heading in its declared unit. Under these
-    # conventions the heading wraps elsewhere, so the turn of each step is wrapped into the range
-    # from -pi to pi.
+    # When the log was read, the wrap-around of the heading was removed as if the declared unit were
+    # right. Under these two conventions the true heading wraps at other values, so the turn of each
+    # step is wrapped into the range from -pi to pi.
     if convention.heading in ("radians", "half_sine"):
         turned = np.mod(turned + np.pi, 2 * np.pi) - np.pi
     after[:, 2] = before[:, 2] + turned
@@ -280,8 +282,8 @@ class Products:
         turns: products of turns with turns (wheel, wheel) [rad^2].
         across: products of turns with body increments (wheel, 3) [rad m].
         body: products of body increments with each other (3, 3) [m^2].
-        known: True if both turns and body increment are known, for every step (every,).
-        weight: weight of each known step (step,).
+        known: for every step, True if its turns and its body increment are finite (every,).
+        weight: weight of each step that is known (step,).
     """
 
     turns: Float[np.ndarray, "wheel wheel"]
@@ -309,7 +311,7 @@ class Products:
 
 
 def usable(*parts: Float[np.ndarray, "step _"]) -> Bool[np.ndarray, " step"]:
-    """Return whether all given arrays are finite, for each step."""
+    """Return, for each step, whether all given arrays are finite."""
     return np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
 
 
@@ -326,7 +328,7 @@ def products(
     Args:
         turns: rotation of each wheel [rad].
         body: body increments ahead [m], left [m] and of the heading [rad].
-        base: base radius, by which heading increments become arcs [m].
+        base: base radius [m], the factor that converts heading increments to arcs.
         rounds: iterations of the reweighted regression; 0 for commands, which have no outliers.
     """
     known = usable(turns, body)

@@ -78,7 +78,8 @@ def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
 def _next_mistake(evidence: Evidence, current: Interpretation) -> Mistake | None:
     """Return the mistake whose correction explains the logs decisively better, or None."""
     before = sum(misfits(evidence, current).values())
-    # Another convention of the poses is accepted only if the poses then follow the wheels.
+    # Another convention of the poses is only a candidate if the poses then follow the wheels, that
+    # is, if it leaves less than `MOST_UNEXPLAINED` of their motion unexplained.
     tried = [
         (sum(left.values()), c)
         for c in candidates(evidence, current)

@@ -43,14 +43,14 @@ LEAST_TRANSLATION = 0.02
 """Least fraction of translation in the predicted motion for which translations are compared [1]."""
 SAME_DATA = 1e-6
 """Relative difference between the wheels' angle and their integrated speed below which the angle
-was computed from the speed [1]."""
+must have been computed from the speed [1]."""
 
 _Range = tuple[float, float, float]
 """Least, usual and largest natural value of a ratio [1]."""
 _WIDE: Mapping[str, _Range] = {
-    # The lower end is small because a robot may slip in place on carpet; it is used if commands
-    # confirm the motion of the wheels. The upper end allows for a camera scale that is wrong by an
-    # eighth.
+    # The lower end is small because a robot may slip in place on carpet. If no command confirms the
+    # motion of the wheels, `_UNVOUCHED` replaces this range. The upper end allows for a camera
+    # scale that is wrong by an eighth.
     "travel": (0.012, 0.8, 1.35),
     "turning": (0.35, 0.8, 1.35),
     # The upper ends are large because commands exceed the motion if brakes or limits act.
@@ -141,7 +141,7 @@ def _gyro(
 ) -> float | None:
     """Return the ratio of rotation by the gyro to that of the poses.
 
-    It is None if there is no gyro, or if gyro and heading have a correlation below 0.5.
+    The ratio is None if there is no gyro, or if gyro and heading have a correlation below 0.5.
     """
     if moved.gyro is None:
         return None
@@ -160,8 +160,8 @@ def _gyro(
 def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
     """Return the ratio of reported to encoder wheel speeds, and whether they are the same data.
 
-    They are the same data if the wheel angle is the integral of the reported speed. The ratio is
-    None in this case, if no speeds were reported, or if no wheel turns.
+    Both are the same data if the wheel angle is the integral of the reported speed. The ratio is
+    None in this case, and also if no speeds were reported or no wheel turns.
     """
     if "wheel_speed" not in data.channels:
         return None, False
@@ -243,7 +243,7 @@ QUANTITIES: Mapping[str, ScaledQuantity] = {
     ),
     "command_twist": ScaledQuantity(
         "command_unit",
-        "the channel twist_command_x and twist_command_y",
+        "the pair of channels twist_command_x and twist_command_y",
         {"drive": 1.0},
         (1e3, 1e2, 10.0),
     ),
@@ -257,7 +257,7 @@ _BY_GEAR = ("wheel_gear", "wheel_turns", "command_wheels", "report")
 
 
 class ScaleCause(NamedTuple):
-    """A cause, that is, a quantity that is wrong by a factor, which explains the ratios.
+    """A quantity that is wrong by a factor, as a possible cause of ratios outside their ranges.
 
     Attributes:
         name: name of the quantity in `QUANTITIES`.

@@ -56,7 +56,7 @@ from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
 
 FEWEST_STEPS = 20
-"""Least number of steps in which poses and wheels can be compared."""
+"""Least number of steps with known wheel rotations for a comparison of poses with wheels."""
 UNEXPLAINED_IF_FOREIGN = 0.4
 """If the best interpretation leaves more than this fraction of the poses' motion unexplained, poses
 and wheels do not belong together [1]."""
@@ -205,7 +205,7 @@ def _of_time(
     if slow or (row < FAST_ROW_S and top > FAST_M_S):
         yield Finding(
             "time_unit",
-            f"rows are {row:.3g} s apart and wheels reach {top:.2g} m/s",
+            f"rows are {row:.3g} s apart and wheels reach {top:.2g} m/s, which is implausible",
             f"set unit = '{'ms' if slow else 's'}' for the channel time",
         )
 

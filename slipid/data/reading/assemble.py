@@ -91,7 +91,7 @@ def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
 
 
 def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time column"]:
-    """Return the latest reading at each time of the clock; the first one before any reading."""
+    """Return the latest reading at each time of `clock`; earlier times get the first reading."""
     if signal.time is clock and not np.isnan(signal.values).any():
         return signal.values.copy()
     out = np.empty((len(clock), signal.values.shape[1]))
@@ -126,8 +126,8 @@ def _angle(
 ) -> Float[np.ndarray, "time wheel"]:
     """Return the cumulative angle of each wheel [rad], 0 in the first row.
 
-    It is computed from the channel `name`: ticks, angles, or speeds, which are integrated. Without
-    such a channel (None) the result has no columns. Remarks are appended to the notes.
+    The angle is computed from the channel `name`: ticks, angles, or speeds, which are integrated.
+    If `name` is None, the result has no columns. Remarks are appended to the notes.
     """
     if name is None:
         return np.zeros((len(clock), 0))

@@ -21,7 +21,7 @@ _LIMITS = {
     "wheel_speed_command": (1000.0, "rad/s"),
     "current": (1000.0, "A"),
     "bus_voltage": (1000.0, "V"),
-    "duty": (1.5, "(a share of 1)"),
+    "duty": (1.5, "(1 is the full supply voltage)"),
     # The voltage comes after bus voltage and duty, since it may be their product: then the error is
     # about the wrong one of these two.
     "voltage": (1000.0, "V"),
@@ -154,7 +154,8 @@ _NAMES = {
     "current": ("current", "motor_torque", "wheel_torque"),
     "voltage": ("voltage", "duty"),
 }
-"""Channels of a file from which a channel of the log may be computed, keyed by the latter."""
+"""Channels of a file from which a channel of the log may be computed, keyed by the channel of the
+log."""
 
 
 def _at(

@@ -98,7 +98,7 @@ class ColumnMeaning:
         label: name of the wheel, such as `fl` or `2`, or component of a quaternion; else empty.
         unit: unit in the name or in the row of units; empty if there is none that suits the
             channel.
-        doubt: text about an assumption that was made, for the user to confirm; else empty.
+        doubt: question about an assumption that was made, for the user to confirm; else empty.
     """
 
     channel: str = ""
@@ -136,14 +136,14 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
 
 @lru_cache(maxsize=4096)
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit that converts to the unit of some channel."""
+    """Return whether a string is a unit that converts to the unit of some channel."""
     return bool(text.strip()) and any(
         converts(text, target) for target in {*CHANNELS.values(), "pixel"}
     )
 
 
 def unit_in(text: str) -> str:
-    """Return the unit that a text stands for, such as V or ma; empty if it is not a unit."""
+    """Return the unit that a string such as V or ma stands for; empty if it is not a unit."""
     return text if is_unit(text) else _SUFFIXES.get(text.lower(), "")
 
 
@@ -184,7 +184,7 @@ class NameParts:
 
     Attributes:
         roles: (role, value, word) of each known word, such as ("what", "speed", "vel").
-        numbers: numbers in the name, as texts.
+        numbers: numbers in the name, as strings.
         unknown: words that are not in the dictionary.
         mended: corrected misspellings, written as `headng -> heading`.
     """
@@ -262,7 +262,7 @@ def _apart(word: str) -> list[str]:
 
 
 def _doubt(parts: NameParts, channel: str) -> str:
-    """Return a text about an assumption that was made about a name, empty if none was made."""
+    """Return a question about an assumption that was made about a name, empty if none was made."""
     if channel.startswith("twist") and not parts.has("what", "command"):
         return "is it a command? Measured speeds must not be used here"
     if parts.mended:

@@ -33,6 +33,7 @@ PER_WHEEL = {
     "voltage": "V",
     "duty": "1",
 }
+"""Channels with a column for each wheel or motor, and their SI units."""
 SINGLE = {
     "time": "s",
     "twist_command_x": "m/s",
@@ -44,8 +45,9 @@ SINGLE = {
     "pose_y": "m",
     "pose_heading": "rad",
 }
+"""Channels with a single column, and their SI units."""
 SEVERAL = {"pose_quaternion": "1"}
-"""Channels with a fixed number of columns: x, y, z and w of a quaternion."""
+"""Channels with a fixed number of columns, and their SI units: x, y, z and w of a quaternion."""
 CHANNELS: dict[str, str] = {**SINGLE, **SEVERAL, **PER_WHEEL}
 """Every channel that a layout may name, with its SI unit."""
 GROUPS = {
@@ -127,7 +129,7 @@ class SensorLayout:
     max_heading_jump: Positive = 1.6
 
     def lacks(self, channels: Collection[str]) -> str | None:
-        """Return a text about a missing channel or setting that some channels need, or None.
+        """Return a message about a missing channel or setting that some channels need, or None.
 
         `channels` are all channels of a run.
         """
@@ -204,7 +206,7 @@ class Layout(SensorLayout):
     def to_si(self, channel: str) -> float:
         """Return the factor from the unit of a channel to SI units.
 
-        For a channel in pixels, it includes the metres per pixel.
+        For a channel in pixels, the factor includes `metres_per_pixel`.
 
         Raises:
             ValueError: the unit cannot be converted, or `metres_per_pixel` is needed and not given.

@@ -11,8 +11,8 @@ from slipid.data.reading.units import converts
 from slipid.support.errors import DataError, bad_data, did_you_mean
 
 SHAFT_GEAR_RATIO = 10.0
-"""Gear ratio of the layout; it is fictitious, and lets a motor shaft turn ten times faster than the
-checks allow for a wheel."""
+"""Fictitious gear ratio of the layout, with which the checks allow a motor shaft to turn ten times
+faster than a wheel."""
 _CHANNELS = ("time", "voltage", "current", "motor_speed", "motor_angle", "duty", "bus_voltage")
 _INSTEAD = {"motor_speed": "motor_angle", "motor_angle": "motor_speed"}
 """Alternative channels: a channel is not searched for if its alternative is given."""
@@ -43,7 +43,7 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
     For channels without given columns, columns are found by their names.
 
     Args:
-        format: format of the file, with the positions of names and numbers.
+        format: format of the file, with the lines of its names and numbers.
         given: columns named by the user, keyed by channel.
         signed: True if currents have a sign.
 
@@ -88,10 +88,10 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
 
 
 def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, ...]:
-    """Return the columns whose names denote a channel; a single one for time and bus voltage.
+    """Return the columns whose names denote a channel; only the first for time and bus voltage.
 
-    Names that need an assumption, and names without the number of a motor, are used only if no
-    other names denote the channel.
+    Columns whose meaning the user must confirm (`ColumnMeaning.doubt`), and columns without the
+    number of a motor, are used only if there are no others.
     """
     found = {name: one for name, one in meanings.items() if one.channel == channel}
     names = [name for name, one in found.items() if not one.doubt] or list(found)
@@ -115,7 +115,7 @@ def _channel(
 
 
 def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) -> None:
-    """Raise `DataError` if a required channel is missing, or the numbers of motors differ.
+    """Raise `DataError` if a required channel is missing, or channels differ in number of motors.
 
     `names` are the columns of the file, for the message.
     """
@@ -132,6 +132,6 @@ def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) 
     if len({*count.values()}) > 1:
         listed = ", ".join(f"{k} {', '.join(map(str, channels[k].columns))}" for k in count)
         raise DataError(
-            f"{path}: columns for different numbers of motors ({listed}); expected as many for "
-            "every channel: name the columns of each channel by options"
+            f"{path}: columns for different numbers of motors ({listed}); expected the same number "
+            "for every channel: name the columns of each channel by options"
         )

@@ -40,7 +40,7 @@ def _camera(x: str, y: str, angle: str, unit: str = "pixel") -> dict[str, Channe
 
 
 # Scale of the camera along x and y, as its owners calibrated it. At this scale, logged motion is
-# too short by a factor of about 1.117. A fit estimates this factor; the reader does not correct it.
+# too short by a factor of about 1.117, which is not corrected here, because a fit estimates it.
 _METRES_PER_PIXEL = (1.8404619693756104e-3, 1.8371639251708984e-3)
 _ROBOTINO = Layout(
     channels={},
@@ -229,7 +229,7 @@ def _declared_file(table: Mapping[str, object], where: str) -> Layout:
 
 
 def _file_problem(layout: Layout) -> str | None:
-    """Return a text about a contradiction in the layout of a single file, or None."""
+    """Return a message about a contradiction in the layout of a single file, or None."""
     have = layout.channels
     single = {name: len(c.columns) for name, c in have.items() if name in SINGLE}
     if not have:
@@ -251,7 +251,7 @@ def _file_problem(layout: Layout) -> str | None:
 
 
 def _problem(layout: Layout) -> str | None:
-    """Return a text about a contradiction between the layouts of a run's files, or None."""
+    """Return a message about a contradiction between the layouts of a run's files, or None."""
     files = [layout, *layout.beside.values()]
     names = [name for one in files for name in one.channels if name != "time"]
     if twice := [name for name in names if names.count(name) > 1]:

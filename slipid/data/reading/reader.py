@@ -26,8 +26,8 @@ from slipid.support.errors import DataError, first_names
 AnyLayout = Layout | BagLayout
 """Layout of a file of rows (CSV or Parquet) or of a bag."""
 Session = Literal["surface/load/speed", "folder", "file"]
-"""Property that the runs of one session have in common; within a session the marker stayed in the
-same place on the robot."""
+"""Property that the runs of one session have in common; within a session the camera's marker was
+not moved on the robot."""
 
 
 def read_runs(
@@ -108,9 +108,9 @@ def read_logs(
         path: the file.
         layout: layout of the file.
         root: data folder above the file, to which the names of the runs are relative.
-        surface: name of the surface; `folder` stands for the name of the file's folder without
-            `_surface`. A bag, or the table of its runs, may name another.
-        load: name of the load set-up; a bag, or the table of its runs, may name another.
+        surface: name of the surface; `folder` stands for the name of the file's folder without the
+            suffix `_surface`. A bag, or the table of its runs, may name another surface.
+        load: name of the load set-up; a bag, or the table of its runs, may name another one.
     """
     surface = path.parent.name.removesuffix("_surface") if surface == "folder" else surface
     known = Identity(path.relative_to(root).as_posix(), path, "", surface, load)
@@ -185,7 +185,7 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
     """Return the files and bag folders under `root` that match a glob, sorted by name.
 
     Raises:
-        DataError: none matches.
+        DataError: there is no such folder, or nothing in it matches.
     """
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs")
@@ -226,8 +226,8 @@ def _run_starts(table: Table, layout: Layout) -> list[int]:
         time = table.stacked(layout.channels["time"])[:, 0]
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
-        # In these runs the largest count only grows in magnitude, since the robot drives away from
-        # its start; so a decrease marks a restart.
+        # In files with this layout the robot only drives away from the start of each run, so the
+        # largest count of a wheel grows in magnitude, and a decrease marks a restart.
         count = np.abs(table.stacked(layout.channels["wheel_ticks"])).max(axis=1)
         return [0, *(np.flatnonzero(np.diff(count) < 0) + 1).tolist()]
     return [0]

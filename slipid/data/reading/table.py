@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pyarrow import Table as ParquetTable
 
 MISSING = {"", "nan", "na", "n/a", "null", "none"}
-"""Texts of cells, in lower case, that mean a missing number."""
+"""Contents of cells, in lower case, that mean a missing number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Table:
     Attributes:
         path: path of the file.
         sha256: SHA-256 hash of the file's bytes.
-        names: names of the columns that were read, or their positions as texts if they have no
+        names: names of the columns that were read, or their positions as strings if they have no
             names.
         values: numbers in the cells, NaN where a cell is empty.
         lines: line number in the file of each row of `values` (record number for Parquet), from 1.
@@ -59,7 +59,7 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
 
     Args:
         path: the file.
-        layout: layout with the positions of names and numbers, and with the columns to read.
+        layout: layout with the lines of names and numbers, and with the columns to read.
         all_columns: True to read all columns of the file, not only those that the layout uses.
 
     Raises:
@@ -124,7 +124,7 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
         import pyarrow
         import pyarrow.parquet as parquet
     except ImportError as error:
-        expected = "pyarrow to read it with: pip install 'slipid[parquet]'"
+        expected = "the package pyarrow, which reads such files; run: pip install 'slipid[parquet]'"
         raise bad_data(path, "a Parquet file", expected) from error
     try:
         table = parquet.read_table(pyarrow.BufferReader(raw))
@@ -138,9 +138,9 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
 def parquet_numbers(
     path: Path, raw: bytes
 ) -> tuple[list[str], Float[np.ndarray, "row column"], frozenset[int]]:
-    """Return the names and numbers of a Parquet file, and the positions of columns with texts.
+    """Return the names and numbers of a Parquet file, and the positions of columns of other types.
 
-    The numbers of a column with texts are NaN.
+    A column of another type, such as strings, has NaN for its numbers.
     """
     import pyarrow
 
@@ -192,7 +192,7 @@ def number_in(cell: str) -> float | None:
 
 
 def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
-    """Return the name of every column, empty if it has none; without names, the positions as texts.
+    """Return the name of every column, empty if it has none; positions if the file has no names.
 
     Raises:
         DataError: the file ends before the row of names, another delimiter is used, or the names
@@ -212,14 +212,14 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
         return [str(position) for position in range(len(cells))]
     if all(number_in(cell) is not None for cell in cells if cell):
         expected = f"the column names ({first_names(map(str, layout.columns))})"
-        raise bad_data(path, "numbers", expected, row=row)
+        raise bad_data(path, "numbers instead of column names", expected, row=row)
     return cells
 
 
 def wanted_names(
     path: Path, header: list[str], layout: Layout, all_columns: bool
 ) -> tuple[str, ...]:
-    """Return the names of the columns to read, or their positions as texts.
+    """Return the names of the columns to read, or their positions as strings.
 
     Raises:
         DataError: a column of the layout is missing, or a name occurs more than once.
@@ -283,9 +283,9 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
 def cell_numbers(
     body: Sequence[str], delimiter: str, where: Sequence[int]
 ) -> tuple[Float[np.ndarray, "row column"], Bool[np.ndarray, "row column"]]:
-    """Return the numbers in some columns of lines, and whether each cell is a text.
+    """Return the numbers in some columns of lines, and whether each cell is another string.
 
-    Numbers are NaN where a cell is empty or a text.
+    Numbers are NaN where a cell is empty or another string.
 
     Args:
         body: lines of the file.

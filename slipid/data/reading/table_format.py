@@ -27,11 +27,11 @@ ROWS = 50_000
 """Largest number of rows whose numbers are examined."""
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _HEADER_LINES = 60
-"""Number of first lines in which the header is searched."""
+"""Number of first lines that are searched for the header."""
 _LEAST_ROWS = 10
 """Files with fewer rows of numbers are not logs but, for example, files of settings."""
 _SAMPLE_BYTES = 200_000
-"""Number of first bytes of a file in which its format is searched."""
+"""Number of first bytes of a file from which its format is determined."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class TableNumbers:
 
     Attributes:
         format: format of the file.
-        values: numbers in the cells, NaN where a cell is empty or a text.
-        texts: positions of the columns with texts in them.
+        values: numbers in the cells, NaN where a cell is empty or another string.
+        texts: positions of the columns that have strings in more than 2 % of their cells.
     """
 
     format: TableFormat
@@ -104,8 +104,8 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
     names_row, units_row = _header_rows(rows[:first], len(rows[first]))
     top = rows[names_row - 1] if names_row else []
     if not top and any(number_in(c) is None and c.lower() not in MISSING for c in rows[first]):
-        expected = "a log: a row of column names, or numbers alone"
-        raise bad_data(path, "texts among the numbers, and no names", expected, row=first + 1)
+        expected = "a log with a row of column names, or with numbers only"
+        raise bad_data(path, "text among the numbers, and no names", expected, row=first + 1)
     width = len(top) or len(rows[first])
     names = [*top, *[""] * width][:width]
     if names_row and width > 1 and not names[-1]:

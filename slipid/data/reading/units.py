@@ -83,7 +83,7 @@ def converts(unit: str, target: str) -> bool:
 
 
 def same_unit(one: str, other: str) -> bool:
-    """Return whether two texts mean the same unit, such as "pix" and "pixel".
+    """Return whether two strings mean the same unit, such as "pix" and "pixel".
 
     The result is False if one of them is not a known unit.
     """

@@ -86,7 +86,7 @@ def test_effort_odometry_and_other_joints_raise_questions(tmp_path):
     said = "\n".join(config.questions)
     assert "what is the effort: a current (A)" in said
     assert "Odometry of wheels is of no use" in said
-    assert "joints that are not taken for wheels: arm" in said
+    assert "are these joints no wheels: arm" in said
     assert "current" not in tomllib.loads(config.text)["layouts"]["mine"]["topics"]
 
 

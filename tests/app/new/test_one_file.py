@@ -163,7 +163,7 @@ def test_files_without_names_are_read_by_position_with_questions(tmp_path):
     layout = layout_in(config)
     assert (layout["names_row"], layout["first_data_row"]) == (0, 1)
     assert layout["columns"]["wheel_ticks"]["columns"] == [4, 5]
-    assert sum("by its numbers: is it?" in q for q in config.questions) == 5
+    assert sum("guessed from the numbers: is it" in q for q in config.questions) == 5
 
 
 def test_four_wheels_are_put_in_the_order_of_the_drive(tmp_path):
@@ -197,7 +197,7 @@ def test_errors_of_the_reader_are_questions(tmp_path):
     rows[100] += ",7"
     path.write_text("\n".join(rows) + "\n")
     _, config = proposed(path, **ROBOT)
-    assert any("the reader says" in q and "row 101" in q for q in config.questions)
+    assert any("reading fails" in q and "row 101" in q for q in config.questions)
 
 
 def test_the_unit_of_a_heading_beyond_a_turn_follows_from_the_turn_rate(tmp_path):

@@ -1,6 +1,6 @@
-"""Definitions of message types: the numbers and texts in a message of each type.
+"""Definitions of message types: the numbers and strings in a message of each type.
 
-They are taken from the bag, else from .msg files, else from the standard types of ROS.
+Definitions are taken from the bag, else from .msg files, else from the standard types of ROS.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ FieldType = Union[str, "ArrayType", "MessageType"]
 """Type of a field: the numpy type of a number without byte order (such as `f8`), `TEXT`, an array,
 or another message."""
 TEXT = "text"
-"""Type of a text in UTF-8."""
+"""Type of a UTF-8 string."""
 _DTYPES = {
     **{f"int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},
     **{f"uint{8 * size}": f"u{size}" for size in (1, 2, 4, 8)},
@@ -51,7 +51,7 @@ class MessageType:
 
     @cached_property
     def paths(self) -> dict[str, str]:
-        """Type, such as `float64[]` or `text`, of every number and text by its path.
+        """Type, such as `float64[]` or `text`, of every number and string, keyed by its path.
 
         A path has the names of nested fields, separated by dots.
         """
@@ -59,13 +59,14 @@ class MessageType:
 
 
 def _below(kind: FieldType, path: str) -> Iterator[tuple[str, str]]:
-    """Yield the path and the type of every number and text in a field."""
+    """Yield the path and the type of every number and string in a field."""
     if isinstance(kind, str):
         yield path, _NAMES.get(kind, kind)
     elif isinstance(kind, ArrayType):
         count = "" if kind.count is None else str(kind.count)
         for below, what in _below(kind.element, path):
-            # Brackets follow the type of the number, also for arrays inside messages of an array.
+            # An array of messages is an array of each number in them, so its brackets follow the
+            # type of the number.
             yield below, f"{what}[{count}]"
     else:
         for name, inner in kind.fields.items():

@@ -159,7 +159,7 @@ def declared_bag_layout(
 
 
 def _channel_problem(name: str, channel: TopicChannel) -> str | None:
-    """Return a text about a contradiction in the settings of one channel, or None."""
+    """Return a message about a contradiction in the settings of one channel, or None."""
     if name not in _NAMES:
         return unknown("channel", name, _NAMES)
     if channel.frame is not None and name != "pose":
@@ -186,7 +186,7 @@ def _channel_problem(name: str, channel: TopicChannel) -> str | None:
 
 
 def _problem(layout: BagLayout) -> str | None:
-    """Return a text about a contradiction in the layout, or None."""
+    """Return a message about a contradiction in the layout, or None."""
     have = set(layout.topics)
     for group, inner in GROUPS.items():
         if group in have and (twice := have & set(inner)):

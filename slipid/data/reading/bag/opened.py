@@ -33,7 +33,7 @@ class BagTopic:
     Attributes:
         bag: the bag.
         name: name of the topic.
-        connections: rosbags' records of its publishers.
+        connections: connections of the topic in the package rosbags, one for each publisher.
     """
 
     bag: "OpenBag"
@@ -42,7 +42,7 @@ class BagTopic:
 
     @cached_property
     def type(self) -> str:
-        """Type of the messages, such as `sensor_msgs/msg/Imu`; several are joined by " and "."""
+        """Type of the messages, such as `sensor_msgs/msg/Imu`; " and " joins several types."""
         return " and ".join(dict.fromkeys(one.msgtype for one in self.connections))
 
     @cached_property
@@ -59,11 +59,11 @@ class BagTopic:
         return definition_of(where, self.type, first, self.bag.definitions)
 
     def messages(self) -> Iterator[tuple[int, bytes]]:
-        """Yield the time of receipt [ns] and the bytes of each message, as `OpenBag.messages`."""
+        """Yield the time of receipt [ns] and the bytes of each message of the topic."""
         return ((received, data) for _, received, data in self.bag.messages([self.name]))
 
     def shape(self, data: bytes, number: int) -> MessageShape:
-        """Return the byte layout of a message; raise `DataError` if it contradicts its definition.
+        """Return the byte layout of a message; raise `DataError` if its bytes contradict its type.
 
         `number` is the number of the message in the topic, from 1.
         """
@@ -103,7 +103,7 @@ class OpenBag:
 
     @cached_property
     def topics(self) -> dict[str, BagTopic]:
-        """Every topic by name."""
+        """All topics, keyed by name."""
         found: dict[str, list[rosbags.interfaces.Connection]] = {}
         for reader in self.readers:
             for connection in reader.connections:
@@ -175,12 +175,12 @@ def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str
             if any(part.suffix == ".zstd" for part in files.parts) or files.storage != "mcap":
                 raise
             notes.append(
-                f"metadata.yaml does not match the files, which were read without it ({error})"
+                f"metadata.yaml does not match the files, so they were read without it ({error})"
             )
     elif files.path.is_dir():
         notes.append("the folder has no metadata.yaml: the recording was cut off")
         if packed := [part.name for part in files.parts if part.suffix == ".zstd"]:
-            expected = f"it unpacked; run: zstd -d {packed[0]}"
+            expected = f"the unpacked file; run: zstd -d {packed[0]}"
             raise bad_data(files.path, f"{packed[0]} without metadata.yaml", expected)
     readers = []
     for part in files.parts:
@@ -223,7 +223,7 @@ def damage_error(files: BagFiles, error: Exception) -> DataError:
         return bad_data(files.path, f"cannot be read ({error.strerror})", OPENABLE)
     if isinstance(error, KeyError) and error.args[0] in ("protobuf", "jsonschema", "flatbuffer"):
         found = f"it contains messages encoded as {error.args[0]}, which cannot be read"
-        expected = "ROS messages only; remove the others with: mcap filter"
+        expected = "ROS messages only; remove all other messages with: mcap filter"
         return bad_data(files.path, found, expected)
     if "Profile is not ros2" in text:
         expected = (

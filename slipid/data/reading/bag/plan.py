@@ -22,7 +22,8 @@ _JOINT_ARRAYS = {"position": "rad", "velocity": "rad/s", "effort": None}
 _KNOWN: dict[str, dict[str, tuple[str, str]]] = {
     "sensor_msgs/msg/Imu": {"gyro": ("angular_velocity.z", "rad/s")},
     "sensor_msgs/msg/BatteryState": {"bus_voltage": ("voltage", "V"), "current": ("current", "A")},
-    # Both packages robotino_msgs and rto_msgs have these types, so their names have no package.
+    # The packages robotino_msgs and rto_msgs have the same two types, which are therefore listed
+    # without a package.
     "MotorReadings": {
         "motor_speed": ("velocities", "rpm"),
         "wheel_ticks": ("positions", "tick"),
@@ -55,6 +56,7 @@ _FITTING = {
     "nav_msgs/Odometry, or tf2_msgs/TFMessage with frame and child",
     "twist_command": "geometry_msgs/Twist or TwistStamped",
 }
+"""Message types that contain each channel, for error messages."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +98,7 @@ def _planned(bag: OpenBag, layout: BagLayout, channel: str, spec: TopicChannel) 
         if channel == "pose" and (spec.frame is not None or transforms):
             if not transforms:
                 found = f"messages of type {topic.type} with frame and child"
-                raise topic.error(found, "tf2_msgs/TFMessage, or neither")
+                raise topic.error(found, "tf2_msgs/TFMessage, or no frame and child")
             return _transformed(bag, spec, topic)
         if channel in GROUPS:
             wanted.append((name, _group_pick(channel, spec, topic)))
@@ -237,7 +239,7 @@ def _field_pick(channel: str, spec: TopicChannel, topic: BagTopic) -> tuple[Pick
             found = f"no field '{path}' in {message.name}{did_you_mean(plain, message.paths)}"
             raise topic.error(found, _listed(message))
         if message.paths[plain].startswith("text"):
-            found = f"field '{path}' of {message.name} is a text"
+            found = f"field '{path}' of {message.name} is a string"
             raise topic.error(found, "a field with numbers")
     units = (unit for known_path, unit in known.values() if known_path == paths[0].split("[")[0])
     unit = spec.unit or next(units, None)
@@ -253,7 +255,7 @@ def _joint_pick(
 ) -> tuple[Pick, str]:
     """Return the pick of a channel from an array of JointState messages, and the numbers' unit.
 
-    Without a field in the layout, the array that most likely contains the channel is taken.
+    If the layout gives no field, the array that most likely contains the channel is used.
     """
     likely = "velocity" if "_speed" in channel else "effort"
     array = "position" if channel.endswith("_angle") else likely

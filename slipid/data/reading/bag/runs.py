@@ -54,10 +54,10 @@ class RunSpan:
 def run_spans(
     bag: OpenBag, layout: BagLayout, signals: Mapping[str, Signal], notes: list[str]
 ) -> tuple[RunSpan, ...]:
-    """Return the runs in a bag; without a rule in the layout, the whole bag is one run.
+    """Return the runs in a bag; if the layout has no rule, the whole bag is one run.
 
-    Runs in which the wheels have fewer than two samples are left out, with a note. Runs without a
-    name get a number, except a single run.
+    Runs in which the wheels have fewer than two samples are left out, with a note. A run that has
+    no name gets a number, unless it is the only run.
 
     Raises:
         DataError: there is no run, or the topic or the table of runs is wrong.
@@ -89,7 +89,7 @@ def run_spans(
 def _sampled(signals: Mapping[str, Signal], span: RunSpan) -> bool:
     """Return whether every signal of the wheels has two samples in a run.
 
-    Without signals of the wheels, every signal must have two samples in the run.
+    If there is no signal of the wheels, every signal must have two samples in the run.
     """
     moving = [signals[name] for name in TURNS if name in signals] or list(signals.values())
     ends = [np.searchsorted(signal.time, (span.start, span.end)) for signal in moving]
@@ -97,7 +97,7 @@ def _sampled(signals: Mapping[str, Signal], span: RunSpan) -> bool:
 
 
 def _none(rule: RunRule, found: Sequence[RunSpan], samples: str) -> tuple[str, str]:
-    """Return texts for the error that no run is usable: what was found, and what was expected."""
+    """Return both parts of the error that no run is usable: what was found, what was expected."""
     times = ", ".join(f"{one.start:.3f} to {one.end:.3f} s" for one in found[:3])
     if rule.pause_s is not None:
         return "no run: no wheel moves", f"a wheel that turns by more than {LEAST_MOTION:g} rad"
@@ -150,10 +150,11 @@ def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray
 
 
 def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
-    """Return the samples at which an angle differs by `LEAST_MOTION` from the last such sample.
+    """Return the indices of the samples in which an angle [rad] has moved.
 
-    Therefore noise, or an encoder that alternates between two ticks, does not count as motion. The
-    angle is in rad.
+    The angle has moved if it differs by more than `LEAST_MOTION` from its value in the last sample
+    that was returned, or in the first sample. Therefore noise, or an encoder that alternates
+    between two ticks, does not count as motion.
     """
     found, held = [], float(angle[0])
     changed = np.flatnonzero(np.diff(angle)) + 1
@@ -255,5 +256,5 @@ def _marks(topic: BagTopic, layout: BagLayout, rule: RunRule) -> Iterator[tuple[
 
 
 def _text(shape: MessageShape, path: str | None) -> str | None:
-    """Return the text at a path in a message, or None if there is no path or no text."""
+    """Return the string at a path in a message; None if it is empty, or if there is no path."""
     return next(iter(shape.texts(path) if path else ()), None) or None

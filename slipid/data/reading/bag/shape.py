@@ -1,10 +1,11 @@
 """Byte offsets of the numbers in serialised messages.
 
-Most messages of a topic have the same byte layout: equal texts, and arrays of equal lengths. So one
-message is decoded field by field, and the numbers of all other messages with the same byte layout
-are taken from the same offsets, thousands of messages at a time.
+Most messages of a topic have the same byte layout: their strings are equal, and their arrays have
+equal lengths. So one message is decoded field by field, and the numbers of all other messages with
+the same byte layout are taken from the same offsets, thousands of messages at a time.
 
-A path names a field, such as `motors[0].current`; without an index it stands for all elements.
+A path names a field, such as `motors[0].current`; a path to an array without an index stands for
+all elements.
 """
 
 import re
@@ -22,7 +23,7 @@ _PATH = re.compile(r"[^\W\d]\w*(\[\d+\])?(\.[^\W\d]\w*(\[\d+\])?)*")
 
 
 def check_path(path: str) -> None:
-    """Raise `ValueError` if a text is not a path of a field."""
+    """Raise `ValueError` if a string is not a path of a field."""
     if not _PATH.fullmatch(path):
         raise ValueError(
             f"not a path of a field: '{path}'; expected a path such as motors[0].current"
@@ -54,14 +55,14 @@ class BytePlace:
 
 @dataclass(frozen=True)
 class MessageLeaf:
-    """A number, an array of numbers or a text at one path of a message.
+    """A number, an array of numbers or a string at one path of a message.
 
     Attributes:
         path: path in the message, with the index of every element that is not a number.
-        dtype: numpy type of the numbers, with byte order; empty for a text.
+        dtype: numpy type of the numbers, with byte order; empty for a string.
         offset: offset of the first byte in the message.
-        count: number of elements of an array; None for a single number or a text.
-        text: content of a text; empty for numbers.
+        count: number of elements of an array; None for a single number or a string.
+        text: content of a string; empty for numbers.
     """
 
     path: str
@@ -85,9 +86,9 @@ class MessageShape:
 
     Attributes:
         size: number of bytes of a message.
-        leaves: all numbers, arrays and texts, in the order of the bytes.
-        fixed: offsets of the bytes that are equal in all messages with this byte layout: those of
-            texts and of array lengths.
+        leaves: all numbers, arrays and strings, in the order of the bytes.
+        fixed: offsets of the bytes that are equal in all messages with this byte layout: the bytes
+            of strings and of array lengths.
         values: values of these bytes.
     """
 
@@ -97,7 +98,7 @@ class MessageShape:
     values: UInt8[np.ndarray, " fixed"]
 
     def fits(self, block: UInt8[np.ndarray, "message byte"]) -> Bool[np.ndarray, " message"]:
-        """Return whether each message of a block has this byte layout; all must have its size."""
+        """Return whether each message of a block, all of size `size`, has this byte layout."""
         return np.all(block[:, self.fixed] == self.values, axis=1)
 
     def places(self, path: str) -> tuple[BytePlace, ...]:
@@ -106,12 +107,12 @@ class MessageShape:
         return tuple(p for leaf in leaves for at, p in leaf.numbers() if _within(at, path))
 
     def texts(self, path: str) -> tuple[str, ...]:
-        """Return the texts at a path."""
+        """Return the strings at a path."""
         leaves = (leaf for leaf in self._near(path) if not leaf.dtype)
         return tuple(leaf.text for leaf in leaves if _within(leaf.path, path))
 
     def count(self, path: str) -> int:
-        """Return the number of numbers or texts at a path without indices."""
+        """Return how many numbers or strings there are at a path without indices."""
         return sum(1 if leaf.count is None else leaf.count for leaf in self._near(path))
 
     def _near(self, path: str) -> list[MessageLeaf]:
@@ -141,7 +142,7 @@ def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
         cdr: True if the message is serialised as in ROS 2 (CDR), not as in ROS 1.
 
     Raises:
-        ValueError: the bytes are not a message of this type; the text says why.
+        ValueError: the bytes are not a message of this type; the error message says why.
     """
     walk = _MessageWalk(raw, cdr)
     leaves = tuple(walk.leaves(message, ""))
@@ -161,7 +162,8 @@ class _MessageWalk:
         order: byte order of numbers, `<` or `>`.
         at: offset of the next byte.
         origin: offset from which alignment counts.
-        fixed: first offset, and offset after the last, of each text and length found so far.
+        fixed: first offset, and offset after the last byte, of each string and each array length
+            found so far.
     """
 
     def __init__(self, raw: bytes, cdr: bool) -> None:
@@ -215,16 +217,16 @@ class _MessageWalk:
         return first
 
     def length(self) -> int:
-        """Return the length of an array or a text, which comes next, and skip its bytes."""
+        """Return the length of an array or string, which is the next number, and skip its bytes."""
         at = self.numbers(4, 1)
         self.fixed.append((at, at + 4))
         return int(struct.unpack_from(self.order + "I", self.raw, at)[0])
 
     def text(self) -> str:
-        """Return the text that comes next, and skip its bytes."""
+        """Return the string that comes next, and skip its bytes."""
         size = self.length()
         at = self.numbers(1, size)
         self.fixed.append((at, at + size))
         text = self.raw[at : at + size]
-        # In CDR a text ends with a zero byte, which its length includes.
+        # In CDR the length of a string includes a zero byte at its end, which is removed.
         return (text[:-1] if self.cdr else text).decode(errors="replace")

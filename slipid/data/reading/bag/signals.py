@@ -73,9 +73,9 @@ def cleaned(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
 
 
 def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> None:
-    """Append a note if stamps and times of receipt are both used and clearly differ.
+    """Append a note if stamps and times of receipt are both used and differ.
 
-    The note is added for differences above `NOTED_DIFFERENCE_S`.
+    The note is appended if the difference exceeds `NOTED_DIFFERENCE_S`.
 
     Raises:
         DataError: stamps and times of receipt differ by more than `LARGEST_DIFFERENCE_S`.
@@ -225,10 +225,10 @@ def channel_signal(
     scale = np.array(plan.spec.scale)
     if len(scale) not in (1, columns):
         found = f"{plan.channel} has {columns} columns, but {len(scale)} scales"
-        raise samples.source.error(found, "as many, or one scale for all")
+        raise samples.source.error(found, f"{columns} scales, or one scale for all columns")
     if plan.channel not in PER_WHEEL and columns != 1:
         found = f"{columns} numbers for {plan.channel}"
-        raise samples.source.error(found, "one; name it by its index, such as [0]")
+        raise samples.source.error(found, "one number; select it by its index, such as [0]")
     values = (samples.values * scale + plan.spec.offset) * factor(plan.unit, CHANNELS[plan.channel])
     return Signal(samples.time, values, samples.source)
 
@@ -258,7 +258,7 @@ def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
 def group_signals(
     plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
 ) -> dict[str, Signal]:
-    """Return the signals of a pose (x, y, heading without wrap-around) or a twist, by channel.
+    """Return the signals of a pose (x, y, heading without wrap-around) or twist, keyed by channel.
 
     Args:
         plan: plan of the pose or twist.
@@ -274,8 +274,8 @@ def group_signals(
     else:
         samples = whole_signal(cleaned(checked_stream(streams[0]), layout, notes), notes)
     values = _planar(samples, notes) if plan.channel == "pose" else samples.values
-    # In messages, a heading from a quaternion has the name of the quaternion, and all columns of a
-    # composed pose have one name.
+    # Each signal needs a column name for error messages: a heading that is computed from a
+    # quaternion gets the name of the quaternion, and the signals of a composed pose share a name.
     named = samples.source.columns
     if len(named) == 1:
         named *= 3
@@ -288,9 +288,9 @@ def group_signals(
 
 
 def _planar(samples: Signal, notes: list[str]) -> Float[np.ndarray, "sample 3"]:
-    """Return x [m], y [m] and heading [rad], without wrap-around, of poses.
+    """Return x [m], y [m] and heading [rad] of poses; the heading has no wrap-around.
 
-    The samples have x, y and either a quaternion or a heading. A large tilt is noted.
+    The samples have x, y and either a quaternion or a heading. A tilt above `TILT_NOTED` is noted.
     """
     place = samples.values[:, :2]
     if samples.values.shape[1] == 3:
@@ -312,8 +312,9 @@ def _transformed(
     sources: dict[Edge, SignalSource] = {}
     for stream, (topic, pick) in zip(streams, plan.wanted, strict=True):
         assert isinstance(pick, TransformPick)
-        # In a plan, topics of changing transforms come first. The static topic repeats constant
-        # transforms, of which the last message is used.
+        # In a plan, topics of changing transforms come before the static topic, so a changing
+        # transform has priority. The static topic repeats constant transforms, so only its last
+        # message is used.
         if pick.edge not in moving and len(stream.number):
             if topic.endswith(STATIC):
                 stream = finite(stream.part(np.array([len(stream.number) - 1])), layout, notes)

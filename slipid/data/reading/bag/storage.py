@@ -159,8 +159,8 @@ def repaired(path: Path) -> RepairedMcap | None:
             if len(head) < 9:
                 break
             kind, length = struct.unpack("<BQ", head)
-            # Reading stops at the end of the data, after which there are no messages, at a zero
-            # byte, and at a record that was cut off.
+            # Reading stops at the record that ends the data, since no messages follow it, or at a
+            # zero byte, or at a record that was cut off.
             if kind == _DATA_END or kind == 0 or end + 9 + length > size:
                 break
             end, records = file.seek(end + 9 + length), records + 1

@@ -21,8 +21,8 @@ MAX_SHAPES = 256
 """Largest number of remembered byte layouts of a topic; when it is reached, all are discarded, to
 save memory and time."""
 FEW_SHAPES = 16
-"""Number of new byte layouts in a batch with which all its messages are compared; after these,
-every message is decoded separately."""
+"""Largest number of new byte layouts, per batch and message size, with which all remaining messages
+are compared; when it is exceeded, every message is decoded separately."""
 STAMPS = ("header.stamp", "stamp")
 """Paths at which a message may have a time stamp."""
 POSITION = ("translation.x", "translation.y", "translation.z")
@@ -30,7 +30,7 @@ ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
 
 
 class Edge(NamedTuple):
-    """Names of the frames of a transform, which is the pose of frame `child` in frame `parent`."""
+    """Names of the two frames of a transform, the pose of frame `child` in frame `parent`."""
 
     parent: str
     child: str
@@ -65,7 +65,7 @@ class Located:
     def of(
         cls, shape: MessageShape, numbers: Sequence[BytePlace | None] = (), part: str = ""
     ) -> "Located":
-        """Return the byte offsets of the numbers and of the time stamp in messages of a layout.
+        """Return the byte offsets of the numbers and time stamp in messages with this byte layout.
 
         `part` is the path of the part of the message that has the stamp, followed by a dot; it is
         empty for the whole message.
@@ -92,7 +92,7 @@ class FieldPick:
 
     Attributes:
         paths: paths of the fields.
-        columns: names of the numbers; until a message with numbers was seen, the paths.
+        columns: names of the numbers; the paths until `located` has found numbers in a message.
     """
 
     paths: tuple[str, ...]
@@ -102,7 +102,7 @@ class FieldPick:
         self.columns = self.paths
 
     def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """Return the byte offsets of each row's numbers in messages with a byte layout."""
+        """Return a `Located` for each row of numbers in messages with this byte layout."""
         each = {path: shape.places(path) for path in self.paths}
         numbers = [place for places in each.values() for place in places]
         if not numbers:
@@ -130,7 +130,7 @@ class JointPick:
     names: dict[str, None] = field(default_factory=dict)
 
     def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """Return the byte offsets of each row's numbers in messages with a byte layout."""
+        """Return a `Located` for each row of numbers in messages with this byte layout."""
         names, places = shape.texts("name"), shape.places(self.array)
         self.names.update(dict.fromkeys(names))
         # An array with another length than the names, such as an empty one, cannot be assigned to
@@ -151,7 +151,7 @@ class TransformPick:
     columns: tuple[str, ...] = (*POSITION, *ROTATION)
 
     def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """Return the byte offsets of each row's numbers in messages with a byte layout."""
+        """Return a `Located` for each row of numbers in messages with this byte layout."""
         rows = []
         for k, edge in enumerate(edges_of(shape)):
             if edge == self.edge:
@@ -223,7 +223,11 @@ def collected(
 
 
 class _Rows(NamedTuple):
-    """Rows of numbers from messages with one byte layout; `stamp` is that of the message [ns]."""
+    """Rows of numbers from messages with one byte layout.
+
+    `stamp` is the time stamp of each row's message [ns], or None; `received` is its time of receipt
+    [ns], and `number` its number in the topic, from 1.
+    """
 
     stamp: Int[np.ndarray, " row"] | None
     received: Int[np.ndarray, " row"]
@@ -274,7 +278,8 @@ class _Collector:
         delay = None if stamp is None else float(np.median(received - stamp)) / 1e9
         time = stamp if stamped and stamp is not None else received
         stream = Stream(self.topic, columns, time, delay, number, values, absent)
-        # Rows were appended by byte layout, and transform by transform, not in order of messages.
+        # Rows were appended by byte layout, and transform by transform, so they may have to be
+        # sorted into the order of the messages.
         in_order = (np.diff(number) >= 0).all()
         return stream if in_order else stream.part(np.argsort(number, kind="stable"))
 

@@ -32,12 +32,14 @@ _SELF_EXPLAINED = (
     "motor_speed",
     "current",
 )
+"""Channels, or groups of channels, that common message types contain in known fields and units."""
 _JOINTS = {"wheel_angle": "position", "wheel_speed": "velocity"}
+"""Array of a JointState message that contains each channel."""
 
 
 @dataclass(frozen=True)
 class TopicField:
-    """Description of a number, text or array in the messages of a topic.
+    """Description of a number, string or array in the messages of a topic.
 
     Attributes:
         path: path by which a layout names it, such as `motors.current`.
@@ -126,8 +128,8 @@ def _described(topic: BagTopic) -> Topic:
 def read_bag(known: Identity, layout: BagLayout) -> list[RawRun]:
     """Return every run in a bag.
 
-    A pose becomes the channels pose_x, pose_y and pose_heading (without wrap-around), a twist
-    twist_command_x, _y and _yaw.
+    A pose becomes the channels pose_x, pose_y and pose_heading (without wrap-around); a twist
+    becomes twist_command_x, twist_command_y and twist_command_yaw.
 
     Args:
         known: name of the bag, its path, and the surface and load set-up that are used if the bag
@@ -146,7 +148,7 @@ def read_bag(known: Identity, layout: BagLayout) -> list[RawRun]:
         signals = _signals(bag, layout, notes)
         spans = run_spans(bag, layout, signals, notes)
         known = replace(known, sha256=sha256.result())
-        # If two channels are read from one topic, its notes occur twice.
+        # Two channels that are read from one topic give the same notes, so repetitions are removed.
         return [_run(known, span, signals, tuple(dict.fromkeys(notes))) for span in spans]
 
 

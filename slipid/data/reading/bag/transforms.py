@@ -41,8 +41,8 @@ class TransformSeries:
     def at(self, time: Float[np.ndarray, " time"]) -> "TransformSeries":
         """Return the transform at other times [s].
 
-        Translations are interpolated linearly, rotations linearly along the shorter arc. A single
-        sample is used for all times.
+        Translations are interpolated linearly. Quaternions are interpolated linearly as well, along
+        the shorter arc, and then normalised. A single sample is used for all times.
         """
         if len(self.time) == 1:
             rows = np.zeros(len(time), dtype=int)

@@ -128,7 +128,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
         (
             "gyro",
             {"topic": "/imu", "field": "header.frame_id", "unit": "rad/s"},
-            ("is a text", "a field with numbers"),
+            ("is a string", "a field with numbers"),
         ),
         (
             "gyro",
