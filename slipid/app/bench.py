@@ -20,9 +20,8 @@ from slipid.data.reading.motor_layout import GivenColumns, motor_layout
 from slipid.data.reading.reader import read_logs
 from slipid.data.reading.table_format import format_of
 from slipid.data.runs import counted_once
-from slipid.infer.bench.fit import fit_motor
+from slipid.infer.bench.fit import check_records, fit_motor
 from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
-from slipid.infer.bench.record_checks import check_records
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.parameter import entries
 from slipid.search_space import Choice

@@ -1,4 +1,7 @@
-"""Fit of a robot to the logs of a config or to runs, with verdicts and result files."""
+"""Fit of a robot to the logs of a config or to runs, with verdicts and result files.
+
+One of the verdicts compares the fit's open-loop predictions of its own runs with encoder odometry.
+"""
 
 import math
 import time
@@ -14,8 +17,8 @@ from slipid.app.check import sanity
 from slipid.app.config import read_config
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
-from slipid.app.trust import trust_report
 from slipid.data.check.findings import wrong
+from slipid.data.runs import Runs
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise
@@ -23,10 +26,13 @@ from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
-from slipid.infer.verdicts.disputed import Trust
+from slipid.infer.verdicts.disputed import EndPoints, Trust, verdict_of_trust
 from slipid.infer.verdicts.profile import Profile, profile, profiled
+from slipid.predict import open_loop as replay
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
-from slipid.predict.slip_models import slip_models
+from slipid.predict.kinematics import Encoder
+from slipid.predict.slip_models import FloorModels, slip_models
+from slipid.predict.validation import ScoredRun, add_scores
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_json
@@ -319,3 +325,42 @@ def _with_baselines(fit: Fit, task: FitTask) -> Fit:
     learnt = [model.fit(cut, fit.robot) for model in slip_models(shape, fit.channels.current)]
     plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}
     return replace(fit, baselines=plain)
+
+
+ENCODER = FloorModels(Encoder())
+MOST_RUNS = 24
+"""Largest number of predicted runs on each floor, which are picked evenly from the fitted runs."""
+
+
+def trust_report(fit: Fit, data: Runs) -> Trust:
+    """Return the verdict on a fit from open-loop predictions of the runs that it was fitted to."""
+    some = data.subset(_picked(data))
+    runs: dict[int, ScoredRun] = {}
+    try:
+        cuts = replay.replay_windows(some, fit.robot)
+    except DataError:  # the fitted lag may be so large that a short run has no windows
+        cuts = []
+    for w in cuts:
+        plain = replay.tracks_from_increments(fit.robot, w, ENCODER.increments(w, fit.robot))
+        for name, tracks in ((fit.contact.name, fit.contact.tracks(w)), (ENCODER.name, plain)):
+            add_scores(runs, some, name, tracks, None)
+    errors: dict[str, list[list[float]]] = {}
+    for run in runs.values():
+        off = [score.endpoint_error_over_path for score in run.models.values()]
+        errors.setdefault(run.surface, []).append(off)
+    floors = {
+        name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
+    }
+    return verdict_of_trust(floors, fit.converged, fit.parameters.values(), len(runs))
+
+
+def _picked(data: Runs) -> list[int]:
+    """Return the indices of at most `MOST_RUNS` runs on every floor."""
+    of_floor: dict[str, list[int]] = {}
+    for k, log in enumerate(data.logs):
+        of_floor.setdefault(log.surface or "unknown", []).append(k)
+    out = []
+    for runs in of_floor.values():
+        at = np.unique(np.linspace(0, len(runs) - 1, MOST_RUNS).round().astype(int))
+        out += [runs[k] for k in at]
+    return sorted(out)

@@ -1,7 +1,9 @@
-"""`slipid benchmark`: run published slip systems and slipid on the same logs."""
+"""`slipid benchmark` and `slipid paper`: compare slip methods, and reproduce the 2021 paper."""
 
 from pathlib import Path
 from typing import Annotated
+
+import typer
 
 from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, flag, guarded, option
 from slipid.support.progress import Reporter
@@ -30,8 +32,7 @@ def benchmark(
     computed again. The exit code is 1 if anything failed.
     """
     from slipid.lab.benchmark.benchmark import benchmark as run
-    from slipid.lab.benchmark.plots import benchmark_pictures
-    from slipid.lab.benchmark.report import show_benchmark, write_page
+    from slipid.lab.benchmark.report import benchmark_pictures, show_benchmark, write_page
     from slipid.lab.benchmark.work import BenchmarkOptions
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
@@ -56,3 +57,16 @@ def benchmark(
         *(row for row in floor_rows if row["absent"]),
     ]
     return 1 if failed else 0
+
+
+@guarded
+def paper(
+    data: Annotated[Path, option("DIR", "Folder that contains the folder robotino2021.")],
+    out: Out,
+) -> int:
+    """Regenerate the tables and figures of the 2021 paper from the paper's data."""
+    from slipid.lab.paper2021.plots import run
+
+    for path in run(data, out):
+        typer.echo(str(path))
+    return 0

@@ -9,10 +9,9 @@ import threading
 
 import typer
 
-from slipid.cli.benchmark import benchmark
+from slipid.cli.benchmark import benchmark, paper
 from slipid.cli.calibrate import calibrate
 from slipid.cli.check import check
-from slipid.cli.compare import compare
 from slipid.cli.demo import demo
 from slipid.cli.design import design
 from slipid.cli.export import export
@@ -20,15 +19,13 @@ from slipid.cli.floors import floors
 from slipid.cli.identify import identify
 from slipid.cli.map import map_
 from slipid.cli.motor import motor
-from slipid.cli.new import new
-from slipid.cli.paper import paper
-from slipid.cli.reference import reference
+from slipid.cli.new import new, reference
 from slipid.cli.sample import sample
 from slipid.cli.selftest import selftest
 from slipid.cli.simulate import simulate
 from slipid.cli.track import track
 from slipid.cli.trial import trial
-from slipid.cli.validate import validate
+from slipid.cli.validate import compare, validate
 
 app = typer.Typer(
     name="slipid",

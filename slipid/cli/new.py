@@ -1,4 +1,4 @@
-"""`slipid new`: write a config for a new robot."""
+"""`slipid new` and `slipid reference`: write a new robot's config, and list a config's keys."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -132,3 +132,25 @@ def _show(config: "NewConfig", out: Path, data: str) -> None:
     typer.echo(f"  slipid check {out} --data {data}")
     typer.echo("or, before driving, simulate which parameters a plan of runs would identify:")
     typer.echo(f"  slipid selftest {out}")
+
+
+@guarded
+def reference(
+    what: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[WHAT]",
+            help="Part to print: config, drives, layouts, channels, units, presets or parameters; "
+            "all by default.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None, option("CONFIG", "Config of the robot whose parameters are listed.")
+    ] = None,
+) -> int:
+    """Print every key, channel, unit and parameter of configs, with meanings (Markdown)."""
+    from slipid.app.config import read_config
+    from slipid.app.reference.page import reference
+
+    typer.echo(reference(what, None if config is None else read_config(config)), nl=False)
+    return 0

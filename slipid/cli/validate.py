@@ -1,8 +1,19 @@
-"""`slipid validate`: predict runs open loop with a fit, and compare with the logged poses."""
+"""`slipid validate` and `slipid compare`: judge a fit, or slip models, by open-loop predictions."""
 
 from pathlib import Path
+from typing import Annotated
 
-from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, for_robots
+from slipid.cli.common import (
+    ConfigFile,
+    DataFolder,
+    Json,
+    Out,
+    OutFolder,
+    Quiet,
+    emit,
+    for_robots,
+    option,
+)
 from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
@@ -31,3 +42,30 @@ def run(out: Path, data: Path, report: Reporter) -> Content:
     drawn = validate_plots(fit, dataset, found, out)
     report.line(f"in {out}: {', '.join(path.name for path in drawn)}")
     return found.to_json()
+
+
+@for_robots
+def compare(
+    config: ConfigFile,
+    data: DataFolder,
+    out: Out,
+    folds: Annotated[
+        str, option("NAMES", "Kinds of held-out runs, separated by commas.")
+    ] = "sectors,speeds,random",
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
+    """Find the best slip model for each floor by cross-validation, if the data can decide it.
+
+    Every model is fitted without the held-out runs and then judged by its predictions of them.
+    Writes comparison.json and a picture. Finished folds are kept in OUT and are not fitted again.
+    """
+    from slipid.app.compare import compare as run
+    from slipid.plots.compare import compare_plot
+    from slipid.report.answers import show_comparison
+
+    with Reporter(quiet=quiet) as report:
+        found = run(config, data, out, folds.replace(" ", "").split(","), report)
+        report.line(f"written to {out}: comparison.json, {compare_plot(found, out).name}")
+    emit(json, found, lambda page: show_comparison(page, found))
+    return 0 if all(q["converged"] for q in found["questions"].values()) else 1

@@ -23,11 +23,10 @@ from slipid.deploy.twin_run import (
     twin_plant,
 )
 from slipid.exports.c99.folder import Recording, c_files
-from slipid.exports.description import readme, warnings
+from slipid.exports.description import readme, table_files, warnings
 from slipid.exports.folder import check_folder, check_writable, write_folder
 from slipid.exports.ros.folder import ros2_files
 from slipid.exports.stablehlo import load_program, stablehlo_files
-from slipid.exports.table import table_files
 from slipid.robot import trajectory
 from slipid.robot.closed_loop import PERIOD, ControlLoop, run_closed_loop
 from slipid.robot.deployed import DeployedRobot

@@ -1,4 +1,4 @@
-"""Maximum a posteriori fit, which alternates Student-t weights, numbers and noise variances."""
+"""Maximum a posteriori fit, which alternates Student-t weights, parameters and noise variances."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -70,7 +70,7 @@ def optimise(
     free: np.ndarray | None = None,
     variances: bool = True,
 ) -> Optimum:
-    """Return the maximum a posteriori, from a staged start or continued from a state.
+    """Return the maximum a posteriori, searched from `staged_start` or from a given state.
 
     Args:
         keep: 1 for segments that are fitted, 0 for held-out ones, in the order of
@@ -78,7 +78,7 @@ def optimise(
             argument only, so that they share compiled functions.
         start: state to continue from instead of the staged start.
         most_rounds: largest number of rounds.
-        tolerance: the fit stops after a round in which every fitted number changed by less than
+        tolerance: the fit stops after a round in which every fitted parameter changed by less than
             this many posterior stds, and every log variance by less than three times as much.
         tell: function called after every round, for progress and checkpoints.
         free: 1 for coordinates that may change from the start, 0 for fixed ones (free,).
@@ -99,7 +99,7 @@ def optimise(
     covariance = problem.laplace(state.z, state.log_variance, keep)
     reason = f"{most_rounds} rounds without convergence"
     if settled := state.moved < tolerance:
-        reason = f"no number changed by {100 * tolerance:g} % of its std in round {state.round}"
+        reason = f"no parameter changed by {100 * tolerance:g} % of its std in round {state.round}"
     return Optimum(state, covariance, settled, reason, tuple(history))
 
 
@@ -111,11 +111,11 @@ def one_round(
     steps: int,
     scoring: int,
 ) -> FitState:
-    """Return the state after one round: weights, then numbers, then variances.
+    """Return the state after one round: weights, then parameters, then variances.
 
     Args:
         mask: 1 for coordinates that may move, 0 for fixed ones.
-        steps: largest number of solver steps of the numbers.
+        steps: largest number of solver steps of the parameters.
         scoring: number of scoring steps of the variances.
     """
     objective, log_v = problem.objective, jnp.asarray(state.log_variance)
@@ -140,7 +140,8 @@ def one_round(
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force, near = linear(objective, jnp.asarray(z), electric, near)
     effect = effects_given(weighed.effects, root["motion"], whole["motion"])
-    # Weights and effects depend on each other, and full steps of both could oscillate forever.
+    # Weights and effects depend on each other: full steps of both could oscillate forever, so the
+    # effects change by half a step.
     effect = 0.5 * (effect + before) if state.round else effect
     residual = without_effects(objective, whole, effect)
     voltage = problem.voltage_information(z, log_v, motor_force)
@@ -149,16 +150,14 @@ def one_round(
     for _ in range(scoring):
         log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), voltage)
         last, voltage = voltage, problem.voltage_information(z, log_v, motor_force)
-        if (
-            last is not None and voltage is not None
-        ):  # Voltage residuals are divided by their noise.
+        # The spread that divides voltage residuals depends on log_v, which has just changed.
+        if last is not None and voltage is not None:
             scale = jnp.sqrt(voltage.share / last.share)
             residual = residual | {"voltage": voltage.residual}
             both = scale[:, :, None] * scale[:, None, :]
             spread = spread | {"voltage": spread["voltage"] * both}
-    if (
-        voltage is not None and scoring
-    ):  # A changed noise does not merely rescale the derivative by R.
+    # A changed noise does more than rescale the derivative with respect to R: it is computed anew.
+    if voltage is not None and scoring:
         electric = problem.electric(z, log_v)
         whole, jacobian, *_ = linear(objective, jnp.asarray(z), electric, near)
     information = np.asarray(problem.precision(jacobian, log_v, keep))
@@ -186,9 +185,9 @@ def one_round(
 def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], None]) -> FitState:
     """Return a start for the joint fit: motor by regression, then each floor from several starts.
 
-    While all other numbers are fixed, floors have no number in common, so that one fit in which
-    only the floors' numbers may move fits each floor independently. The start with the least loss
-    is chosen floor by floor.
+    While all other parameters are fixed, floors have no parameter in common, so that one fit in
+    which only the floors' parameters may move fits each floor independently. The start with the
+    least loss is chosen floor by floor.
     """
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)
@@ -206,18 +205,14 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
-        for steps in (
-            15,
-            6,
-            6,
-        ):  # The damping of the solver starts at 1, far below the scale of the problem.
+        # Many steps at first, since the damping starts at 1, far below the scale of the problem.
+        for steps in (15, 6, 6):
             state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
         found = problem.whitening(residual, state.log_variance, problem.full_weight)
-        cost = -np.log(
-            np.asarray(found.weight["motion"])
-        )  # loss per segment, up to a factor and an offset
+        # the loss of each segment, up to a factor and an offset
+        cost = -np.log(np.asarray(found.weight["motion"]))
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
             if mine < best[number]:
@@ -255,7 +250,7 @@ class RoundInputs(eqx.Module):
         prior_std: prior std of every coordinate.
         electric: noise that predictions of voltages depend on.
         motor_force: motor forces at z [mu m g], from which currents and voltages are predicted.
-        slope: derivative of log |d residuals / d data| by the search vector.
+        slope: derivative of log |d residuals / d data| with respect to the search vector.
     """
 
     objective: Objective
@@ -270,7 +265,7 @@ class RoundInputs(eqx.Module):
 
 
 class LinearisedResiduals(NamedTuple):
-    """Whitened residuals of all blocks and of the prior, their derivative by the step, and twists.
+    """Whitened residuals of all blocks and of the prior after a step of the solver.
 
     Attributes:
         residual: whitened residuals.
@@ -297,8 +292,9 @@ def levenberg(
     steps do not count: each makes the next one smaller, so that a round that stopped after refused
     steps would look like convergence.
 
-    The loop is not compiled: it takes no time beside the Jacobians, while its compilation would
-    take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for the constants.
+    The loop is not compiled: it takes little time compared with the Jacobians, while its
+    compilation would take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for
+    the constants.
 
     Args:
         linearised: function that returns the residuals at a vector, given twists near its own.

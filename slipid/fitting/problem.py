@@ -1,4 +1,4 @@
-"""Posterior of a robot's numbers given windows of its runs, compiled once per shape of windows."""
+"""Posterior of a robot's parameters given windows of its runs, compiled once for each shape."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -46,7 +46,7 @@ from slipid.search_space import HELD, Choice, Space
 CREEPS = (0.05, 0.4, 1.0)
 """Start values of the creep (slip ratio of full traction) of every floor.
 
-From other values, fits have ended in poor local minima.
+Fits from other start values have ended in poor local minima.
 """
 _NEAR_ZERO = 1e-4
 """Value of a viscous term that cannot be determined."""
@@ -68,7 +68,7 @@ class FitState:
         loss: minus log posterior up to a constant.
         moved: largest change in the last round: of a number in posterior stds, or a third of the
             change of a log variance.
-        stage: current stage of the fit, as text for progress reports.
+        stage: current stage of the fit, as a string for progress reports.
         effect: mean shared effects along, across [m/m] and in yaw [rad/m]; None before the first
             estimate.
     """
@@ -82,12 +82,12 @@ class FitState:
     effect: Float[np.ndarray, "segment 3"] | None = None
 
     def shared(self, segments: int) -> Float[np.ndarray, "segment 3"]:
-        """Return the shared effects of that many segments, zero before any were estimated."""
+        """Return the shared effects of `segments` segments; zero before the first estimate."""
         return np.zeros((segments, 3)) if self.effect is None else self.effect
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """Values that a checkpoint stores, by name."""
+        """Values that a checkpoint stores, keyed by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
@@ -100,13 +100,14 @@ class FitState:
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    Currents and voltages do not change the numbers that motion determines (a "cut" posterior): the
-    torque scale is estimated from currents given the motion, and the errors of the motion are
+    Currents and voltages do not change the parameters that motion determines (a "cut" posterior):
+    the torque scale is estimated from currents given the motion, and the errors of the motion are
     propagated. Otherwise a motor friction model that is accurate to 5 % of the current would
     overrule forces that motion determines to 1 %.
 
     The argument `keep` of the methods is 1 for segments that are used and 0 for others. `compiled`
-    holds functions that other modules compiled for windows of these shapes, under their own keys.
+    holds functions that other modules have compiled for windows of these shapes; each module
+    chooses keys that no other module uses.
     """
 
     def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
@@ -129,10 +130,10 @@ class Problem:
         return other
 
     def holding(self, fixed: Sequence[Choice], choices: Sequence[Choice]) -> "Problem":
-        """Return the same problem with some parameters fixed, unless `choices` say otherwise.
+        """Return the same problem with some parameters fixed, unless `choices` override this.
 
-        Their priors are so narrow that they cannot move. The search vector keeps its coordinates,
-        so that nothing is compiled anew.
+        The priors of these parameters are so narrow that their values cannot change. The search
+        vector keeps its coordinates, so that nothing is compiled anew.
         """
         narrow = [
             Choice(c.pattern, start=c.fixed, prior_mean=c.fixed, prior_std=HELD * c.fixed)
@@ -170,7 +171,7 @@ class Problem:
     def carried_over(self, state: FitState, of: "Problem") -> FitState:
         """Return a state of another problem as a state of this one.
 
-        Both problems have the same fitted numbers. Variances are matched by name; those that the
+        Both problems have the same fitted parameters. Variances are matched by name; those that the
         other problem does not have start at their typical values.
         """
         known = dict(zip(of.noise.names, state.log_variance, strict=True))
@@ -213,7 +214,7 @@ class Problem:
     ) -> Float[np.ndarray, "free free"]:
         """Return the covariance of the search vector: inverse information, prior included.
 
-        With `alone`, every run is treated as if it shared no effects with others.
+        If `alone`, every run is treated as if it shared no effects with others.
         """
         jacobian = self.linear(z, self.electric(z, log_v))[1]
         information = variances.precision(self.objective, jacobian, log_v, keep, alone)
@@ -232,7 +233,7 @@ class Problem:
     def loss(
         self, z: Vector, log_v: Vector, keep: Vector, at: "WeighedResiduals", e: lk.ElectricNoise
     ) -> float:
-        """Return minus the log posterior of numbers and variances, up to a constant.
+        """Return minus the log posterior of parameters and variances, up to a constant.
 
         Args:
             at: weighted residuals at z and log_v.
@@ -246,13 +247,13 @@ class Problem:
         return nll + 0.5 * float(np.sum(deviation**2)) + 0.5 * float(np.sum(spread**2))
 
     def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
-        """Return the noise that predictions of voltages depend on, at given numbers, variances."""
+        """Return the noise that predictions of voltages depend on, at given values."""
         return _electric(self.objective, z, log_v)
 
     def voltage_information(
         self, z: Vector, log_v: Vector, motor_force: Array
     ) -> VoltageInformation | None:
-        """Return the information of voltages about variances, None if none are logged."""
+        """Return what voltages tell about variances; None if no voltages are logged."""
         if "voltage" not in self.noise.blocks:
             return None
         return voltage_information(self.objective, z, log_v, motor_force)
@@ -306,9 +307,9 @@ class GivenMotion(eqx.Module):
     """Motion from which currents and voltages are predicted while the search vector changes.
 
     Attributes:
-        applies: True if electric residuals depend on electric numbers alone, given this motion;
-            False if they depend on all numbers at once.
-        z: search vector from which the other numbers are taken.
+        applies: True if electric residuals depend on electric parameters alone, given this motion;
+            False if they depend on all parameters at once.
+        z: search vector from which the other parameters are taken.
         motor_force: motor forces at z [mu m g].
     """
 
@@ -325,7 +326,7 @@ class Twists(NamedTuple):
     Attributes:
         steady: twists of the windows on one floor.
         multi_floor: twists of the windows of runs over several floors, None without such runs.
-        electric: the same with the electric numbers of `GivenMotion` replaced.
+        electric: the same twists for the robot from which currents are predicted.
     """
 
     steady: lk.NearTwists
@@ -359,7 +360,7 @@ class ResidualsAt(NamedTuple):
 def linear(
     objective: Objective, z: Vector, electric: lk.ElectricNoise, near: Twists | None = None
 ) -> ResidualsAt:
-    """Return residual blocks, their Jacobians, and the forces of every motor.
+    """Return the residuals at a search vector, with electric residuals that depend on all of it.
 
     `near` holds the twists at a search vector close to z, which make the root finder faster.
     """
@@ -372,7 +373,7 @@ def linear(
 def linear_given(
     objective: Objective, z: Vector, electric: lk.ElectricNoise, given: GivenMotion, near: Twists
 ) -> ResidualsAt:
-    """Return residual blocks, their Jacobians, and the forces of every motor.
+    """Return the residuals at a search vector, given the motion that electric residuals assume.
 
     Both kinds of electric residuals are compiled together: to compile them apart would take longer
     than a whole fit to few runs.
@@ -392,8 +393,8 @@ def linear_given(
         out |= lk.electric_residuals(electrical, batch, force, electric)
         twists = Twists(p.twist, None, None)
         if (of := objective.multi_floor) is not None:
-            # friction is an electric number that changes the motion of runs over several floors, so
-            # that their currents need a prediction of their own
+            # friction is an electric parameter that changes the motion of runs over several floors,
+            # so that their currents need a prediction of their own
             mine = lk.predict(robot, of.batch, near.multi_floor)
             theirs = lk.predict(electrical, of.batch, near.electric)
             out |= of.residuals(electrical, theirs)
@@ -401,33 +402,33 @@ def linear_given(
             twists = Twists(p.twist, mine.twist, theirs.twist)
         return out, ResidualsAt(out, {}, force, twists)
 
-    direction = np.arange(space.size) if objective.multi_floor else _directions(space)
+    tangent = np.arange(space.size) if objective.multi_floor else _tangents(space)
 
-    def along(change: Array) -> tuple[Blocks, ResidualsAt]:
+    def changed(change: Array) -> tuple[Blocks, ResidualsAt]:
         return jax.jvp(blocks, (jnp.asarray(z),), (change,), has_aux=True)[1:]
 
-    changes = (np.arange(direction.max(initial=-1) + 1)[:, None] == direction).astype(float)
-    slopes, found = jax.vmap(along, out_axes=(-1, None))(changes)
+    changes = (np.arange(tangent.max(initial=-1) + 1)[:, None] == tangent).astype(float)
+    slopes, found = jax.vmap(changed, out_axes=(-1, None))(changes)
     if not objective.multi_floor:
-        concerns = _concerns(space, batch)[:, None]
-        slopes = {k: jnp.where(concerns, s[..., direction], 0.0) for k, s in slopes.items()}
+        depends = _dependence(space, batch)[:, None]
+        slopes = {k: jnp.where(depends, s[..., tangent], 0.0) for k, s in slopes.items()}
     return found._replace(jacobian=slopes)
 
 
-def _directions(space: Space) -> Int[np.ndarray, " free"]:
-    """Return the index of the direction in which the derivative is taken for each coordinate.
+def _tangents(space: Space) -> Int[np.ndarray, " free"]:
+    """Return, for each coordinate, the number of the tangent that differentiates it.
 
-    A segment is on one floor, with one load set-up, in one session. Coordinates that differ only in
-    these are changed together: for each segment, the derivative is that of the one coordinate that
-    concerns it. Source: Curtis, Powell and Reid 1974, IMA J. Appl. Math. 13(1).
+    Coordinates of one quantity on different floors, load set-ups or sessions share a tangent: every
+    segment depends on one of them only, so that one derivative gives all their columns of the
+    Jacobian. Source: Curtis, Powell and Reid 1974, IMA J. Appl. Math. 13(1).
     """
     of = [(e.quantity, k) for e in space.free for k in range(e.coordinates)]
     index = {key: number for number, key in enumerate(dict.fromkeys(of))}
     return np.array([index[key] for key in of], int)
 
 
-def _concerns(space: Space, batch: lk.Batch) -> Bool[Array, "segment free"]:
-    """Return True for the coordinates of a segment's floor, load set-up, session, or of all."""
+def _dependence(space: Space, batch: lk.Batch) -> Bool[Array, "segment free"]:
+    """Return True where the residuals of a segment may depend on a coordinate."""
     tree = space.template
     out = jnp.ones((len(batch.surface), space.size), bool)
     for label, names, of in (
@@ -466,15 +467,15 @@ def log_jacobian(
 
 @eqx.filter_jit
 def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
-    """Return every window's body twist (segment, window, 3) and its derivative by z (.., free)."""
+    """Return every window's body twist (segment, window, 3) and its derivatives (.., free)."""
     return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
 
 
 def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
     """Return choices that fix the viscous terms near zero on floors driven at one speed only.
 
-    At one speed they cannot be distinguished from creep, and a wrong division between the two makes
-    wrong predictions at every other speed.
+    At one speed, viscous terms cannot be distinguished from creep, and a wrong division between the
+    two makes wrong predictions at every other speed.
     """
     driven: dict[str, list[float]] = {}
     for k in range(len(data)) if runs is None else runs:

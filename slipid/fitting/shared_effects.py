@@ -303,7 +303,7 @@ class EffectForecast(NamedTuple):
     """Forecast of the shared effects of segments along, across and in yaw.
 
     Attributes:
-        mean: mean effects.
+        mean: posterior means of the effects.
         slope: derivative of the mean with respect to the search vector.
         covariance: covariance of the effects, given the fitted parameters.
     """

@@ -1,8 +1,8 @@
 """Student-t weights of residuals at given variances, and variances estimated by Fisher scoring.
 
 The residuals of a segment have a multivariate Student-t distribution with the scale matrix V of
-`noise`. The restricted likelihood of the variances accounts for the fact that the model's numbers
-were fitted to the same residuals (Patterson and Thompson 1971, Biometrika 58(3)).
+`noise`. The restricted likelihood of the variances accounts for the fact that the parameters were
+fitted to the same residuals (Patterson and Thompson 1971, Biometrika 58(3)).
 """
 
 from typing import Any, NamedTuple
@@ -35,7 +35,7 @@ Variances = Float[np.ndarray, " variance"]
 Square = Float[np.ndarray, "free free"]
 """Covariance or information of the search vector."""
 Blocks = dict[str, Array]
-"""An array for every block of residuals, by name: `motion`, `current`, `voltage`, `crossing.*`."""
+"""Arrays of residual blocks, keyed by name: `motion`, `current`, `voltage`, `crossing.*`."""
 Noises = dict[str, Components]
 """Covariance components of every block."""
 MOTION_BLOCKS = ("motion", MULTI_FLOOR_MOTION)
@@ -50,7 +50,7 @@ class Objective(eqx.Module):
     """Data and priors of a fit, as an argument of compiled functions.
 
     Attributes:
-        space: free numbers and their prior.
+        space: free parameters and their prior.
         batch: runs on one floor each.
         multi_floor: runs over several floors, None if there are none.
         blocks: covariance components of every block.
@@ -59,7 +59,7 @@ class Objective(eqx.Module):
         scored: True for variances that `scoring_step` estimates; those of run, shared and session
             effects and of load biases are estimated in `slipid.fitting.hierarchy`.
         pooled: index of the variance that is the prior variance of the space's pooled coordinates.
-        joint: True if no currents are logged, so that all numbers are estimated from motion.
+        joint: True if no currents are logged, so that all parameters are estimated from motion.
     """
 
     space: Space
@@ -74,7 +74,7 @@ class Objective(eqx.Module):
 
     @eqx.filter_jit
     def prior_std(self, log_v: Vector) -> Array:
-        """Return the prior std of every coordinate at given variances."""
+        """Return the prior std of every coordinate; the pooled ones share one that is estimated."""
         pooled = jnp.exp(0.5 * jnp.asarray(log_v)[self.pooled])
         return jnp.where(self.space.pooled, pooled, jnp.asarray(self.space.prior_std))
 
@@ -83,7 +83,7 @@ class Whitening(NamedTuple):
     """Weighted inverse roots of the covariance of every segment.
 
     Attributes:
-        root: W with W^T W = w V^-1.
+        root: matrix W for which W^T W = w V^-1.
         weight: Student-t weight w, small for an outlier.
         loss: minus log likelihood, less constants.
     """
@@ -94,15 +94,15 @@ class Whitening(NamedTuple):
 
 
 class VoltageInformation(NamedTuple):
-    """Information of voltages about variances; every array is (segment, m).
+    """Information that voltages contain about variances; every array is (segment, m).
 
     Attributes:
         residual: voltage residual, divided by `likelihood.voltage_spread` [V].
         share: ratio of the voltmeter's variance to the whole variance of the undivided residual.
-        slope: derivative of the log likelihood by the scatter of the true current.
+        slope: derivative of the log likelihood with respect to the scatter of the true current.
         information: expected information about that scatter.
-        steeper: excess of the loss's curvature by the log of the voltage noise over its expected
-            value; it is large where other variances explain the residuals.
+        steeper: curvature of the loss with respect to the log variance of the voltage noise, less
+            its expected value; large where other variances explain the residuals.
     """
 
     residual: Array
@@ -116,7 +116,7 @@ class VoltageInformation(NamedTuple):
 def voltage_information(
     objective: Objective, z: Vector, log_v: Vector, motor_force: Array
 ) -> VoltageInformation:
-    """Return the information of voltages about variances, given the forces of every motor."""
+    """Return what voltages tell about variances, given the contact forces of every motor."""
     robot, b = objective.space.tree(z), objective.batch
     noise = electric_noise(objective.blocks, log_v, robot.motor.resistance)
 
@@ -167,7 +167,7 @@ def precision(
 ) -> Array:
     """Return the expected information of the search vector, prior included (free, free).
 
-    Shared effects are marginalised; with `alone` every run is treated as if it shared no effects.
+    Shared effects are marginalised; if `alone`, every run is treated as if it shared no effects.
     """
     prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
     total, of_motion = prior, prior
@@ -202,9 +202,9 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
     """Return the information of p(motion | motion data) p(electric | motion, all data).
 
     If wheels stand on several floors, motion depends on their friction, which is one of the
-    electric numbers `e`. The first factor marginalises friction as if currents contained no
+    electric parameters `e`. The first factor marginalises friction as if currents contained no
     information about it, although the estimated motion does use the friction from currents. The
-    intervals of the motion numbers are therefore somewhat too wide there.
+    intervals of the motion parameters are therefore somewhat too wide there.
     """
     first = of_motion - _schur_term(of_motion, e)
     motion = ~e[:, None] & ~e[None, :]
@@ -212,7 +212,11 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
 
 
 def _schur_term(information: Array, e: Array) -> Array:
-    """Return B^T A^-1 B for the block A of the coordinates e, and B between it and the rest."""
+    """Return the matrix B^T A^-1 B of an information matrix.
+
+    Its block A has the rows and columns of the coordinates `e`; its block B has the rows of these
+    coordinates and the columns of all others.
+    """
     own = jnp.where(e[:, None] & e[None, :], information, jnp.diag(jnp.where(e, 0.0, 1.0)))
     cross = jnp.where(e[:, None] & ~e[None, :], information, 0.0)
     return cross.T @ jnp.linalg.solve(own, cross)
@@ -220,10 +224,10 @@ def _schur_term(information: Array, e: Array) -> Array:
 
 @eqx.filter_jit
 def fitted_covariance(objective: Objective, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
-    """Return the residuals' covariance due to fitted numbers and shared effects (segment, m, m).
+    """Return the residuals' covariance due to fitted parameters and shared effects (segment, m, m).
 
-    The Jacobian is by the search vector, at fixed shared effects; their dependence on the search
-    vector is added here.
+    The Jacobian is with respect to the search vector while shared effects stay fixed; the
+    dependence of shared effects on the search vector is added here.
     """
     cov = jnp.linalg.inv(precision(objective, jacobian, log_v, keep))
     posteriors = expected_posteriors(objective, log_v, keep)
@@ -253,9 +257,9 @@ def scoring_step(
 ) -> Array:
     """Return the log variances after one Fisher-scoring step of the restricted likelihood.
 
-    `residual` are those of any model, less shared effects. `spread` is their covariance due to the
-    numbers and effects that were fitted to them (segment, m, m); it corrects the variances for the
-    degrees of freedom that the fit has used.
+    `residual` holds the residuals of any model, less shared effects. `spread` is their covariance
+    due to the parameters and effects that were fitted to them (segment, m, m); it corrects the
+    variances for the degrees of freedom that the fit has used.
     """
     _, weights, _ = whitening(objective.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
@@ -278,8 +282,8 @@ def scoring_step(
             steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
         others = () if voltage is None else ("current",)
         if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT, *others):
-            # For decreasing log variances, the curvature of the loss exceeds the expected one by
-            # |slope|.
+            # Where log variances decrease, the curvature of the loss exceeds the expected one by
+            # |slope|: without this term the step would be too long.
             steeper = steeper.at[which].add(-slope)
     score -= (log_v - objective.typical) / VARIANCE_SPREAD**2
     info = information(objective.blocks, log_v, keep, voltage)
@@ -305,7 +309,8 @@ def information(
         info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
     if voltage is None:
         return info
-    # the variance of voltage residuals also depends on the scatter of the true currents
+    # The variance of voltage residuals also depends on the scatter of the true currents, whose
+    # components are those of the block `current`.
     noise = noises["current"]
     grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
     kept = jnp.asarray(keep)[noise.segments]
@@ -326,10 +331,10 @@ def _scaled_base(noise: Components, block: str, voltage: VoltageInformation | No
 
 
 def inverse_root(v: Float[Array, "segment m m"]) -> Float[Array, "segment m m"]:
-    """Return L^-1 of V = L L^T for many small matrices at once, column by column.
+    """Return the inverse Cholesky factor L^-1 of V = L L^T for many small matrices at once.
 
-    It is written out because batched LAPACK calls that run in parallel inside one compiled function
-    can deadlock on a computer with two cores (jax 0.10).
+    The algorithm is written out, column by column, because batched LAPACK calls that run in
+    parallel inside one compiled function can deadlock on a computer with two cores (jax 0.10).
     """
     a = jnp.moveaxis(v, 0, -1)
     m = a.shape[0]

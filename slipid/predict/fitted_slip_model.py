@@ -134,7 +134,11 @@ def fit_with_noise(
 
 
 def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:
-    """Return the prior precision of a model's coefficients, with ridges and active bounds."""
+    """Return the precision matrix of the prior of a model's coefficients.
+
+    It is the sum of a vague prior, of the ridge penalties, and of a large precision for each
+    coefficient that the fit left at its bound.
+    """
     held = model.stiffness(w, robot)
     parts = [
         VAGUE_PRECISION * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()

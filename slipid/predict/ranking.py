@@ -49,7 +49,7 @@ class RankedModel:
         verdict: `best`, `tied` or `worse`.
         endpoint_error: mean end-point error, divided by the straight-line displacement of the run.
         endpoint_error_se: standard error of `endpoint_error` over sectors of headings.
-        energy_score: mean energy score [m].
+        energy_score: mean of `Score.energy_score` over runs [m].
         coverage50, coverage90: fraction of runs that ended in their 50 % or 90 % region.
         heading_error_median_deg: median heading error [deg].
     """

@@ -32,7 +32,8 @@ class Score:
         level: probability of the predicted region on whose boundary the measured end point lies,
             None for a model without regions.
         covered90: True if the level is at most 0.9, None for a model without regions.
-        energy_score: energy score [m].
+        energy_score: energy score of the predicted distribution of the end point, a proper score
+            (Gneiting and Raftery 2007); for a single predicted point it is the distance [m].
         log_density: log density of the logged poses [nats], None if it was not computed.
     """
 

@@ -112,7 +112,7 @@ class FloorRecord:
         current_std: std of measured less modelled currents, without the ammeters' noise.
         seen: ranges of speed, torque and so on that the fitted runs cover; None if the parameters
             were given, not fitted.
-        unseen: True for a floor that no run drove on, see `slipid.robot.unseen`.
+        unseen: True for a floor that no run drove on, see `slipid.robot.deployed.with_unseen`.
     """
 
     name: str

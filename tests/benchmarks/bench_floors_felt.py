@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 
-from slipid.lab.benchmark.floors.husky import FOLDER, HuskyFloorTask
+from slipid.lab.benchmark.floors.tasks import HUSKY_FOLDER, HuskyFloorTask
 from slipid.lab.benchmark.work import BenchmarkOptions
 from tests.benchmarks.quick import QUICK
 
 
 def test_floors_that_are_felt(real_data: Path, tmp_path: Path) -> None:
-    if not (real_data / FOLDER).is_dir():
-        pytest.skip(f"no logs of robots without a pose: {real_data / FOLDER} is no folder")
+    if not (real_data / HUSKY_FOLDER).is_dir():
+        pytest.skip(f"no logs of robots without a pose: {real_data / HUSKY_FOLDER} is no folder")
     table = HuskyFloorTask(BenchmarkOptions(real_data, tmp_path, quick=QUICK)).make()
     print(f"\n{table['about']}: {table['runs']} runs; chance {100 * table['chance']:.0f} %")
     for row in table["rows"]:

@@ -131,7 +131,7 @@ def driven(robot, row, path, steps=STEPS):
     from slipid.deploy.floors import floor_of
     from slipid.deploy.twin_run import starts, twin_floor
     from slipid.lab.trial.controllers import ROWS as TRIAL
-    from slipid.lab.trial.plants import drawn_robot
+    from slipid.lab.trial.trial import drawn_robot
     from slipid.robot.closed_loop import PERIOD, ClosedLoopRun, ControlLoop, path_metrics
     from slipid.robot.filter.floor import Floor
     from slipid.robot.interface import Settings

@@ -44,7 +44,7 @@ def ends(robot):
     from slipid.deploy.controllers import control_loop_of
     from slipid.deploy.deploy import actuator_model_of
     from slipid.lab.trial.controllers import ROWS
-    from slipid.lab.trial.plants import drawn_robot
+    from slipid.lab.trial.trial import drawn_robot
     from slipid.robot import trajectory
     from slipid.robot.closed_loop import PERIOD
     from slipid.robot.filter.floor import Floor

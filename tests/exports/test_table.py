@@ -8,7 +8,7 @@ import io
 import numpy as np
 import pytest
 
-from slipid.exports.table import HEAD, table_files
+from slipid.exports.description import HEAD, table_files
 from slipid.robot.controller import Gains, Limits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.robot_file import declared_numbers

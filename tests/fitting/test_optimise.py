@@ -246,7 +246,7 @@ def test_every_round_is_told_and_ends_in_the_result(surface_fit):
     assert told[-1] is best.state
     assert tuple(s.loss for s in told) == best.history
     assert best.state.moved < PRECISE["tolerance"]
-    assert "no number changed" in best.reason
+    assert "no parameter changed" in best.reason
 
 
 def test_going_on_from_a_state_is_the_same_as_not_having_stopped(surface_problem, surface_fit):

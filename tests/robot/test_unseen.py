@@ -12,13 +12,12 @@ import pytest
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.model.se2 import advance
-from slipid.robot.deployed import DeployedRobot
+from slipid.robot.deployed import LOG_CREEPS, LOG_FRICTIONS, DeployedRobot, with_unseen
 from slipid.robot.estimator import Estimator, EstimatorState
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.interface import Readings, Settings
 from slipid.robot.record import EffectRecord
-from slipid.robot.unseen import LOG_CREEPS, LOG_FRICTIONS, with_unseen
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.small_twin import deployed
 

@@ -152,7 +152,11 @@ def _indices(path: Int[np.ndarray, "step 2"], few: Int[np.ndarray, "corner 2"]) 
 def _fitted(
     middles: Float[np.ndarray, "step 2"], index: list[int], tolerance: float
 ) -> Float[np.ndarray, "corner 2"]:
-    """Return corners moved to intersections of the lines fitted between them; ends stay fixed."""
+    """Return the corners of a path, moved to the intersections of lines fitted to the path.
+
+    Each inner corner moves to the intersection of the lines that are fitted to the path on either
+    side of it, unless this is farther away than `tolerance` allows. The ends stay fixed.
+    """
     lines = [_through(middles[a : b + 1]) for a, b in pairwise(index)]
     out = middles[index].copy()
     for k in range(1, len(index) - 1):

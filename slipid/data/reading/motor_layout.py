@@ -88,10 +88,10 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
 
 
 def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, ...]:
-    """Return the columns whose names denote a channel; a single one for time and bus voltage.
+    """Return the columns whose names denote a channel; only the first for time and bus voltage.
 
-    Names that need an assumption, and names without the number of a motor, are used only if no
-    other names denote the channel.
+    Columns whose meaning the user must confirm (`ColumnMeaning.doubt`), and columns without the
+    number of a motor, are used only if there are no others.
     """
     found = {name: one for name, one in meanings.items() if one.channel == channel}
     names = [name for name, one in found.items() if not one.doubt] or list(found)

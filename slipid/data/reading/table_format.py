@@ -27,11 +27,11 @@ ROWS = 50_000
 """Largest number of rows whose numbers are examined."""
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _HEADER_LINES = 60
-"""Number of first lines in which the header is searched."""
+"""Number of first lines that are searched for the header."""
 _LEAST_ROWS = 10
 """Files with fewer rows of numbers are not logs but, for example, files of settings."""
 _SAMPLE_BYTES = 200_000
-"""Number of first bytes of a file in which its format is searched."""
+"""Number of first bytes of a file from which its format is determined."""
 
 
 @dataclass(frozen=True)

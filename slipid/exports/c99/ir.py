@@ -183,7 +183,8 @@ class Array:
     Attributes:
         shape: shape of the array.
         kind: kind of its numbers.
-        axis: axis of the lanes; None without lanes.
+        axis: axis of the lanes (see the module), along which C code loops; None if every element
+            has a cell of its own.
         cells: cells, in the array's shape without the axis of the lanes.
     """
 

@@ -1,19 +1,19 @@
 """Log posterior of many walkers at once for samplers, with the same objective as the fit.
 
-A coordinate is a free number of the search space. Variances and the weights of runs keep their
+A coordinate is a free parameter of the search space. Variances and the weights of runs keep their
 fitted values, and shared effects are marginalised, so that the density is that of nonlinear least
 squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with y from `slipid.fitting.shared_effects.marginal_residuals`, and f the ratio of a Student t's
-information about its centre to a Gaussian's, which the weights in y contain, too. Floors share some
-coordinates and have others of their own, so that the log posterior is a sum
+with y from `slipid.fitting.shared_effects.marginal_residuals`. The factor f is the ratio of a
+Student t's information about its centre to a Gaussian's; the weights in y contain it, too. Floors
+share some coordinates and have others of their own, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
 
-and moves of the numbers of several floors can be proposed in one evaluation and accepted floor by
-floor.
+and moves of the parameters of several floors can be proposed in one evaluation and accepted floor
+by floor.
 
 Electric numbers are drawn for every draw of the motion. Gauss-Newton steps find their most likely
 values given the motion, and proposals come from a Student t around them, whose tails cover those
@@ -41,10 +41,10 @@ Result = TypeVar("Result")
 
 
 class HeldMotion(NamedTuple):
-    """Motion of each walker, given which its electric numbers are drawn.
+    """Motion of each walker, given which its electric parameters are drawn.
 
     Attributes:
-        z: search vector with the walker's numbers of the motion.
+        z: search vector with the walker's parameters of the motion.
         motor_force: contact forces that the motors work against [mu m g].
     """
 
@@ -60,10 +60,10 @@ class _Residuals(NamedTuple):
 
 
 class Density:
-    """Log posterior of a part of a problem's numbers, with the other numbers as fitted.
+    """Log posterior of a part of a problem's parameters, with the other parameters as fitted.
 
     If currents are logged, the part EVERYTHING has the likelihoods of all residuals but is not the
-    posterior, in which currents do not change the numbers of the motion.
+    posterior, in which currents do not change the parameters of the motion.
 
     Attributes:
         structure: index of each coordinate in the search vector.
@@ -79,7 +79,7 @@ class Density:
         self.structure, self.group = coordinates(problem, fitted, part)
         self.names = tuple(problem.space.names[k] for k in self.structure)
         self.anchor = Anchor.at(problem, fitted)
-        # the first density with these coordinates compiles the functions for all others
+        # The first density with these coordinates compiles the functions for all later ones.
         form = part, self.names, self.group.tobytes()
         self._each: dict[Callable[..., object], Callable[..., Any]] = {}
         self._form: Density = problem.compiled.setdefault(form, self)
@@ -98,7 +98,7 @@ class Density:
         """Return the results of a function of (density, anchor, element) for many elements.
 
         `many` are the arrays of the elements, or None, one for each further argument of the
-        function. It is compiled once for all densities with the same coordinates.
+        function. The function is compiled once for all densities with the same coordinates.
         """
         form = self._form
         if of not in form._each:
@@ -205,7 +205,7 @@ class Density:
         out = {"motion": lk.motion_residual(robot, b, p)}
         if self.part == EVERYTHING:
             out |= lk.electric_residuals(robot, b, p.motor_force, anchor.noise(robot))
-        # without the barrier XLA repeats the root finder for every use of the residuals
+        # Without the barrier, XLA would repeat the root finder for every use of the residuals.
         return _Residuals(jax.lax.optimization_barrier(out), robot)
 
     def hold(self, x: Float[np.ndarray, "walker size"]) -> HeldMotion:
@@ -227,7 +227,7 @@ def _explained(posterior: EffectPosterior, white: Float[Array, "segment m"]) -> 
 _STEPS, _PROPOSALS = 4, 16
 """Numbers of Gauss-Newton steps and of proposals for every draw of the motion."""
 _DEGREES = 5.0
-"""Degrees of freedom of the Student t from which electric numbers are proposed."""
+"""Degrees of freedom of the Student t from which electric parameters are proposed."""
 _SCALE_RATIO = 1.15
 """Ratio of the scale of the proposals to that of the Gaussian around the most likely values."""
 
@@ -239,15 +239,15 @@ def electric_given_motion(
     x: Float[np.ndarray, "ensemble draw size"],
     seed: int,
 ) -> tuple[Float[np.ndarray, "ensemble draw size"], Bool[np.ndarray, "draw proposal"]]:
-    """Return draws of the electric numbers, one for every draw of the motion.
+    """Return draws of the electric parameters, one for every draw of the motion.
 
     The second result is a mask of the accepted proposals.
 
     Args:
         first: density of the motion.
-        second: density of the electric numbers given the motion.
+        second: density of the electric parameters given the motion.
         covariance: Laplace covariance of the search vector; Gauss-Newton steps start at its
-            regression of electric numbers on those of the motion.
+            regression of electric parameters on those of the motion.
         x: draws of the motion.
         seed: seed of the proposals.
     """

@@ -1,35 +1,51 @@
-"""The command `slipid benchmark`: slipid and every published system on the same logs."""
+"""The command `slipid benchmark`: slipid and every published system on the same logs.
+
+The benchmark includes closed-loop runs on the rectangle of the 2021 paper, with published
+controllers and slipid's.
+"""
 
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import zip_longest
 from operator import methodcaller
+from pathlib import Path
 
-from slipid.lab.benchmark.floors.husky import HuskyFloorTask, husky_classifiers
+import numpy as np
+
+from slipid.deploy.deploy import ROBOT, robot_of_force_balance
 from slipid.lab.benchmark.floors.protocol import FloorTask
-from slipid.lab.benchmark.floors.robotino import RobotinoFloorTask
+from slipid.lab.benchmark.floors.tasks import HuskyFloorTask, RobotinoFloorTask, husky_classifiers
 from slipid.lab.benchmark.protocols import PROTOCOLS, splits
-from slipid.lab.benchmark.rectangle import CONTROLLERS, RectangleTask
 from slipid.lab.benchmark.rows import ROWS
 from slipid.lab.benchmark.scores import FoldScore, RunScore
 from slipid.lab.benchmark.sets import SOURCES, is_available
-from slipid.lab.benchmark.slipid_rows import NAME
+from slipid.lab.benchmark.slipid_rows import NAME, fit_slipid
 from slipid.lab.benchmark.summary import RowSummary, reading, summary
-from slipid.lab.benchmark.work import MAP_ROW, QUICK_KIND, BenchmarkOptions, FoldTask, data_of
-from slipid.support.checkpoint import versions
+from slipid.lab.benchmark.work import (
+    FIT_SOURCES,
+    MAP_ROW,
+    QUICK_KIND,
+    BenchmarkOptions,
+    FoldTask,
+    data_of,
+    problem_of,
+)
+from slipid.lab.trial import trial
+from slipid.robot.record import LogSensors
+from slipid.support.checkpoint import Checkpoint, key_of, source_hash, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
 from slipid.support.executor import results
-from slipid.support.files import writable, write_json
+from slipid.support.files import read_json, writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.benchmark/1"
 Tables = dict[str, dict[str, dict[str, RowSummary]]]
 """Row summaries, keyed by name of the data set, then of the protocol, then of the row."""
-BenchmarkTask = FoldTask | FloorTask | RectangleTask
-"""A part of the benchmark's work that saves its results in a checkpoint."""
 
 
 def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -> Content:
@@ -65,7 +81,7 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
     rectangle = RectangleTask(options)
     # The floor table of the Robotino comes last, since it reuses slipid's fits to the folds by
     # heading.
-    tasks: list[BenchmarkTask] = [*folds, *floors]
+    tasks: list[FoldTask | FloorTask | RectangleTask] = [*folds, *floors]
     if not options.quick and set(CONTROLLERS) & set(options.only or CONTROLLERS):
         tasks.insert(0, rectangle)
     report.stage(f"{len(tasks)} parts")
@@ -154,3 +170,82 @@ def _set(
         "hash": data.job.data_hash,
         "protocols": protocols,
     }
+
+
+ROBOT_SOURCE = "testsite"
+"""Name of the data set from which the robot of the closed-loop runs is identified."""
+CONTROLLERS = (
+    "encoder",
+    "goswami_padhy",
+    "indiveri",
+    "paper_print",
+    "paper_code",
+    "torque",
+    "contact",
+    "contact_gyro",
+)
+STARTS = 8
+"""Number of starts of every controller."""
+
+
+@dataclass(frozen=True)
+class RectangleTask:
+    """Task that identifies the test site's robot and drives it in closed-loop runs.
+
+    Attributes:
+        options: options of the benchmark.
+        name: name of the task.
+    """
+
+    options: BenchmarkOptions
+    name: str = "rectangle"
+
+    @property
+    def folder(self) -> Path:
+        """Folder of robot.json and of the trial's results."""
+        return self.options.out / self.name
+
+    def run(self) -> str:
+        """Identify the robot of the test site from all its runs, and return the task's name."""
+        setup_jax(quiet=True)
+        self._failure.unlink(missing_ok=True)
+        try:
+            self._identify()
+        except Exception as error:  # the other tasks run even if this one fails
+            write_json(self._failure, {"failed": FoldScore.of_error(error).absent})
+        return self.name
+
+    @property
+    def _failure(self) -> Path:
+        """Path of the file that records why the robot could not be identified."""
+        return self.folder / "failed.json"
+
+    def _identify(self) -> None:
+        """Fit slipid to all runs, and write robot.json."""
+        data = data_of(self.options, ROBOT_SOURCE)
+        code = source_hash(*FIT_SOURCES)
+        key = key_of(data.job.config.hash, data.job.data_hash, code)
+        everybody = np.arange(len(data.logged))
+        kept = Checkpoint(self.folder, key)
+        fit = fit_slipid(data.job, problem_of(self.options, ROBOT_SOURCE), everybody, kept)
+        sensors = LogSensors(current_is_signed=data.logged.current_is_signed, voltage=True)
+        robot_of_force_balance(fit.contact, fit.highest_speed, fit.trend, sensors).save(
+            self.folder / ROBOT
+        )
+
+    def drive(self, executor: Executor, report: Reporter) -> Content:
+        """Run all controllers on the virtual test site, or on the twin if MuJoCo is missing.
+
+        Returns:
+            Content that `slipid trial` writes, or the reason for a failure under the key `failed`.
+        """
+        if self._failure.is_file():
+            return read_json(self._failure, "the reason why there is no robot")
+        plant = "testsite" if find_spec("mujoco") is not None else "twin"
+        only = self.options.only or CONTROLLERS
+        controllers = [name for name in CONTROLLERS if name in only]
+        try:
+            options = trial.TrialOptions(plant, controllers=tuple(controllers), starts=STARTS)
+            return trial.trial(self.folder, options, executor, report).content
+        except Exception as error:  # the benchmark goes on if the trial fails
+            return {"failed": FoldScore.of_error(error).absent}

@@ -9,8 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.deploy.controllers import CONTROLLERS, PAPER_WHEELS, ControllerRow
-from slipid.lab.trial.goswami_padhy import GoswamiPadhy, TuningTask, by_gradient, by_swarm
-from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics
+from slipid.lab.trial.published_laws import (
+    GoswamiPadhy,
+    Indiveri,
+    TuningTask,
+    by_gradient,
+    by_swarm,
+    inverse_kinematics,
+)
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.controller import Gains, Law, Limits
 from slipid.robot.deployed import DeployedRobot

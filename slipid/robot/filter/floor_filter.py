@@ -125,7 +125,7 @@ class FloorFilter(eqx.Module):
         """Return the probability of every hypothesis before any measurement.
 
         Each further floor under the robot reduces the probability by `further_floor_penalty`. All
-        hypothetical floors (`slipid.robot.unseen`) together count as one further floor.
+        hypothetical floors (`slipid.robot.deployed`) together count as one further floor.
         """
         under = hypotheses_of(self.robot).under
         kinds = np.array([len(set(row)) for row in under.tolist()])

@@ -5,8 +5,8 @@ floors. The edge of a floor is nearly straight on the scale of a robot, so the f
 twice from wheel to wheel around the robot: every hypothesis has one floor, or two floors with
 neighbouring wheels on each. That leaves 125 of the 625, and 21 of the 27 for three wheels on
 three floors. Three floors at once, where patches meet at a corner, are represented by the most
-similar hypothesis or by "unknown". A hypothetical floor (`slipid.robot.unseen`) is under all wheels
-or under none.
+similar hypothesis or by "unknown". A hypothetical floor (`slipid.robot.deployed`) is under all
+wheels or under none.
 """
 
 import itertools

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.infer.bench.fit import fit_motor
+from slipid.infer.bench.fit import check_records, fit_motor
 from slipid.infer.bench.motor import BenchMotor, BenchRoot, noise
-from slipid.infer.bench.record_checks import check_records
 from slipid.infer.bench.verdict import BenchFit, bench_fit, misfits
 from slipid.infer.bench.windows import electrical, mechanical
 from slipid.search_space import Choice, Space

@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 
 from slipid.cli.main import app
 from slipid.lab.benchmark import work as benchmark_work
-from slipid.lab.benchmark.benchmark import benchmark, tasks_of
-from slipid.lab.benchmark.rectangle import RectangleTask
+from slipid.lab.benchmark.benchmark import RectangleTask, benchmark, tasks_of
 from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.work import (
     QUICK_RUNS,
@@ -191,6 +190,6 @@ def test_a_robot_that_cannot_be_identified_drives_no_rectangle(tmp_path, monkeyp
     def broken(*_: object) -> None:
         raise OSError("disk on fire")
 
-    monkeypatch.setattr("slipid.lab.benchmark.rectangle.data_of", broken)
+    monkeypatch.setattr("slipid.lab.benchmark.benchmark.data_of", broken)
     assert rectangle.run() == "rectangle"
     assert rectangle.drive(InProcess(), Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}

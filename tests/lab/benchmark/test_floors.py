@@ -18,16 +18,6 @@ from slipid.lab.benchmark.floors.fitting import (
     shown,
     stiffness_of,
 )
-from slipid.lab.benchmark.floors.husky import (
-    COLUMNS,
-    NO_LOAD_A,
-    NO_LOAD_SLOPE,
-    REST_READING_A,
-    HuskyFloorTask,
-    husky,
-    husky_classifiers,
-    read_floor_runs,
-)
 from slipid.lab.benchmark.floors.protocol import (
     EvaluationSettings,
     answers_of,
@@ -36,13 +26,21 @@ from slipid.lab.benchmark.floors.protocol import (
     tuned_classifier,
 )
 from slipid.lab.benchmark.floors.result import Answer, after_seconds, confusion
-from slipid.lab.benchmark.floors.robotino import (
+from slipid.lab.benchmark.floors.slipid_row import SlipidFloorClassifier, kinds
+from slipid.lab.benchmark.floors.tasks import (
+    COLUMNS,
+    NO_LOAD_A,
+    NO_LOAD_SLOPE,
+    REST_READING_A,
+    HuskyFloorTask,
     RobotinoFloorTask,
     beliefs_of,
     floor_signals,
+    husky,
+    husky_classifiers,
+    read_floor_runs,
     robotino_classifiers,
 )
-from slipid.lab.benchmark.floors.slipid_row import SlipidFloorClassifier, kinds
 from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.work import BenchmarkOptions
 from slipid.lab.systems.floors.interface import FloorClassifier, floors_of

@@ -6,8 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slipid.cli.main import app
-from slipid.lab.benchmark.plots import benchmark_pictures
-from slipid.lab.benchmark.report import COLUMNS, LEGEND, page, show_benchmark
+from slipid.lab.benchmark.report import COLUMNS, LEGEND, benchmark_pictures, page, show_benchmark
 from slipid.report.page import Page
 
 
@@ -133,7 +132,7 @@ BROKEN = {
 def test_the_exit_code_is_one_if_anything_failed(broken, tmp_path, monkeypatch):
     content = clean() | (BROKEN[broken] if broken else {})
     monkeypatch.setattr("slipid.lab.benchmark.benchmark.benchmark", lambda *_: content)
-    monkeypatch.setattr("slipid.lab.benchmark.plots.benchmark_pictures", lambda _: {})
+    monkeypatch.setattr("slipid.lab.benchmark.report.benchmark_pictures", lambda _: {})
     requested = ["benchmark", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]
     done = CliRunner().invoke(app, requested)
     assert done.exit_code == (1 if broken else 0), done.output

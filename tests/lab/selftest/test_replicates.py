@@ -175,7 +175,7 @@ turns = 1
 
 def config(folder, more=""):
     text = packaged_config("robotino.toml")
-    head, _, _ = text.partition("# slipid selftest:")
+    head, _, _ = text.partition("[selftest]")
     head = head.replace("tolerance = 0.02", "tolerance = 0.1")
     moved = head.index("[[logs]]", head.index("[[logs]]") + 1)
     head = head[:moved] + head[head.index("# Patterns of parameter names") :]

@@ -412,7 +412,7 @@ def test_the_same_seed_drives_the_same_run():
         (lambda: RobotBuild(rollers=7), r"rollers\s+Input should be a multiple of 2"),
         (lambda: RobotBuild(roller_radius_m=0.05), "roller_radius_m = 0.05 is not less than wheel"),
         (lambda: RobotBuild(mass_kg=1.0), "less than the mass of the wheels"),
-        (lambda: RobotBuild(centres_m={"far": (0.2, 0.0)}), "load far: the centre of mass"),
+        (lambda: RobotBuild(centres_m={"far": (0.2, 0.0)}), "centres_m.far: the centre of mass"),
         (
             lambda: RobotBuild(wheel_azimuths_deg=(0.0, 90.0)),
             r"wheel_azimuths_deg\s+Tuple should have at least 3",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import differential_evolution
 
-from slipid.lab.trial.goswami_padhy import (
+from slipid.lab.trial.published_laws import (
     HIGH_GAINS,
     LOW_GAINS,
     GoswamiPadhy,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics, pose_loop, within_limit
+from slipid.lab.trial.published_laws import Indiveri, inverse_kinematics, pose_loop, within_limit
 from slipid.model.geometry import Geometry, general, mecanum, omni
 
 SHAPES = {

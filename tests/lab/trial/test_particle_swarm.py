@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slipid.lab.trial.goswami_padhy import Swarm, minimise
+from slipid.lab.trial.published_laws import Swarm, minimise
 
 LOW, HIGH = np.array([-2.0, -1.0, 0.0]), np.array([2.0, 3.0, 5.0])
 

@@ -16,9 +16,9 @@ from slipid.deploy.twin_run import path_of, starts
 from slipid.lab.testsite.driving import PERIOD
 from slipid.lab.trial import trial as tr
 from slipid.lab.trial.controllers import ROWS, check_gains, unused_gains
-from slipid.lab.trial.goswami_padhy import GoswamiPadhy
-from slipid.lab.trial.plants import SitePlant, drawn_robot, refuse_unknown_to_site
+from slipid.lab.trial.published_laws import GoswamiPadhy
 from slipid.lab.trial.summary import TrialRun, best_controllers, columns, summaries
+from slipid.lab.trial.trial import SitePlant, drawn_robot, refuse_unknown_to_site
 from slipid.model.geometry import mecanum, omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop

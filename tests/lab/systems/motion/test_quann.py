@@ -6,21 +6,19 @@ import numpy as np
 import pytest
 
 from slipid.lab.systems.motion.features import SignalWindows
-from slipid.lab.systems.motion.gaussian_process import (
-    MOST_WINDOWS,
-    ProcessRows,
-    fitted_numbers,
-    untuned_kernel,
-)
 from slipid.lab.systems.motion.quann import (
     INFLATION_PARTS,
+    MOST_WINDOWS,
+    ProcessRows,
     QuannEnergy,
     QuannSlip,
     end_spread,
     end_squares,
+    fitted_numbers,
     parts,
     places,
     slip_inputs,
+    untuned_kernel,
 )
 from slipid.predict.slip_model import Run, RunSignals, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
