@@ -96,7 +96,7 @@ def collect(
         logs: the runs.
         session: name of each run's session; within a session the camera's marker was not moved on
             the robot. By default the runs with the same surface, load set-up and commanded speed
-            are one session, since the runs of an experiment are usually driven in that order.
+            are one session, since such runs are usually driven one after another.
         aside: one line about each run that was left out because its poses are unusable.
 
     Raises:

@@ -74,7 +74,7 @@ class Objective(eqx.Module):
 
     @eqx.filter_jit
     def prior_std(self, log_v: Vector) -> Array:
-        """Return the prior std of every coordinate; the pooled ones share one that is estimated."""
+        """Return each coordinate's prior std; pooled coordinates have one common, fitted std."""
         pooled = jnp.exp(0.5 * jnp.asarray(log_v)[self.pooled])
         return jnp.where(self.space.pooled, pooled, jnp.asarray(self.space.prior_std))
 

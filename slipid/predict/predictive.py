@@ -163,7 +163,7 @@ class ForceBalance(PredictiveModel):
     Attributes:
         space: free parameters and their prior.
         z: search vector of the fit.
-        shared: fitted effects that neighbouring runs share, keyed by floor.
+        shared: fitted effects that runs in similar directions share, keyed by floor.
         extrapolation: factors, keyed by `floor@load`, that multiply the variances of parameters and
             shared effects for runs that were not fitted.
     """
@@ -236,7 +236,7 @@ class ForceBalance(PredictiveModel):
         return mean, np.einsum("nma,nap->nmp", e, expected.slope)
 
     def tracks(self, w: Windows) -> replay.Tracks:
-        """Return tracks of whole runs, predicted by the force balance and expected effects."""
+        """Return tracks of whole runs, from the force balance and the expected shared effects."""
         increments = np.asarray(replay.contact_increments(self.robot, lk.batch(w, self.robot)))
         mean = self._correction(w)[0].reshape(increments.shape)
         return replay.tracks_from_increments(self.robot, w, increments - mean)

@@ -40,8 +40,9 @@ Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[Builder, tuple[Cell, ...], int], Cell | None]
 """Function that simplifies an operation, given its operands and the number of lanes of the result.
 
-It returns a cell that equals the result, such as one of the operands; None if the operation cannot
-be simplified."""
+A lane is an iteration of the C loop that computes the result, see `slipid.exports.c99.ir`. The
+function returns a cell that equals the result, such as one of the operands; None if the operation
+cannot be simplified."""
 
 
 UNARY = {

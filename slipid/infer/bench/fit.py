@@ -240,7 +240,10 @@ def _scatter(
 def _solved(
     space: Space, z: np.ndarray, equations: Sequence[Equation], s: np.ndarray
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
-    """Return the optimum at fixed weights and scatter, and its covariance."""
+    """Return the optimum of the free parameters, and its covariance.
+
+    The weights of the equations and the covariance S of all moments, `s`, are held fixed.
+    """
     std = np.sqrt(np.maximum(np.diag(s), 1e-300))
     # S is singular for collinear signals, as in a log at one speed, hence the 1e-9
     root = np.linalg.inv(np.linalg.cholesky(s / std / std[:, None] + 1e-9 * np.eye(len(s)))) / std

@@ -139,7 +139,10 @@ class Anchor(eqx.Module):
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:
-        """Return a robot's prediction; the search for twists starts near those of the fit."""
+        """Return the prediction for a robot, whose search vector is `z`.
+
+        The root finder for the twists starts from those of the fit, extrapolated linearly to `z`.
+        """
         return lk.predict(robot, self.batch, self.twist + self.twist_slope @ (z - self.z))
 
     def noise(self, robot: Robot) -> lk.ElectricNoise:

@@ -15,8 +15,9 @@ HISTORY_STEPS = 48
 """Number of entries in the history, the last step included; it limits the age of a delayed
 measurement."""
 MAP_EXPONENT = 0.25
-"""Exponent of the likelihood that the belief about floors gives a pose [1]. It is below 1 because
-an error of the map affects many steps, so that the evidence of these steps is not independent."""
+"""Exponent applied to the likelihood of a pose, which follows from the belief about floors [1]. It
+is below 1 because an error of the map affects many steps, so that the evidence of these steps is
+not independent."""
 
 
 class PoseState(eqx.Module):

@@ -58,7 +58,8 @@ class MessageLeaf:
     """A number, an array of numbers or a string at one path of a message.
 
     Attributes:
-        path: path in the message, with the index of every element that is not a number.
+        path: path in the message, such as `poses[2].name`. Arrays of messages or strings have one
+            leaf per element, with its index; an array of numbers is one leaf, without an index.
         dtype: numpy type of the numbers, with byte order; empty for a string.
         offset: offset of the first byte in the message.
         count: number of elements of an array; None for a single number or a string.
