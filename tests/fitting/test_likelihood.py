@@ -102,6 +102,19 @@ def test_jacobians_are_those_of_finite_differences(everything):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("moved", [1e-3, np.nan, 1e6])
+def test_residuals_do_not_depend_on_the_twists_that_the_root_finder_starts_from(everything, moved):
+    """From good twists, from none, and from such as lead plain Newton steps astray."""
+    volt = electric_noise(everything.batch, 0.05)
+    first = linear(everything.objective, everything.space.start, volt)
+    near = first.twists._replace(steady=np.asarray(first.twists.steady) + moved)
+    again = linear(everything.objective, everything.space.start, volt, near)
+    for block, residual in first.residual.items():
+        np.testing.assert_allclose(again.residual[block], residual, atol=1e-9)
+        np.testing.assert_allclose(again.jacobian[block], first.jacobian[block], atol=1e-7)
+
+
+@pytest.mark.slow
 def test_every_number_but_the_known_silent_ones_moves_the_residuals(everything):
     _, jacobian = everything.linear(everything.space.start, electric_noise(everything.batch, 0.05))
     size = sum(np.abs(np.asarray(j)).sum(axis=(0, 1)) for j in jacobian.values())
