@@ -128,4 +128,4 @@ def test_runs_over_several_floors_have_to_be_named(small, tmp_path):
     words = ("--map", half_carpet(tmp_path / "map.toml"), "--data", folder / "logs")
     done = invoke("floors", folder / "out", *words, "--out", tmp_path / "out", "--quiet")
     assert done.exit_code == 2
-    assert "expected --logs GLOB" in done.stderr
+    assert "expected the option --logs GLOB" in done.stderr

@@ -46,7 +46,7 @@ def test_processes_are_others_and_a_dead_one_is_an_error():
     with Processes(2) as executor:
         assert os.getpid() not in results(executor, where, TODO, Reporter(quiet=True))
     with (
-        pytest.raises(DataError, match="a process ended before its job"),
+        pytest.raises(DataError, match="a worker process ended before its job"),
         Processes(1) as executor,
     ):
         results(executor, gone, {"one": 1}, Reporter(quiet=True))
