@@ -110,6 +110,7 @@ def test_residuals_do_not_depend_on_the_twists_that_the_root_finder_starts_from(
     near = first.twists._replace(steady=np.asarray(first.twists.steady) + moved)
     again = linear(everything.objective, everything.space.start, volt, near)
     for block, residual in first.residual.items():
+        assert np.isfinite(residual).all()
         np.testing.assert_allclose(again.residual[block], residual, atol=1e-9)
         np.testing.assert_allclose(again.jacobian[block], first.jacobian[block], atol=1e-7)
 
