@@ -20,7 +20,7 @@ Robotics and Automation 12(6).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Literal
@@ -33,15 +33,16 @@ from scipy.stats import t as student
 from slipid.data.align.lag import pose_lag
 from slipid.data.runs import Runs
 from slipid.fitting.innovations import (
-    Innovations,
-    Noise,
+    Motion,
     PoseTracks,
-    Sensor,
-    aligned_headings,
     innovations,
-    moved,
+    linear_innovations,
+    loss_of_noise,
+    pose_tracks,
+    sensor_yaw,
+    start_headings,
 )
-from slipid.model.kinematics import Kinematics, is_axle, matrices, nominal_base
+from slipid.model.kinematics import Kinematics, is_axle, nominal_base
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 
@@ -56,18 +57,23 @@ LAG_STD, YAW_STD, SESSION_STD = 0.3, 0.5, 0.02
 LOOSE_SCALE_STD = 0.01
 """Relative prior std of the scale of positions above which the radius stays at the config's, since
 motion determines only their ratio."""
+WHOLE_TURN, MEAN_TURN = 1.0, 0.3
+"""Changes of heading by the encoders that show a track or base: in any run, or on average over the
+runs on a floor [rad]. Smaller ones are errors of the speed controllers, not turns."""
 DEGREES = 4.0
 """Degrees of freedom of the Student t of runs."""
 LEAST_CLUSTERS = 12
 """Number of parts into which runs are divided for the jackknife if there are fewer runs."""
-MOST_ROUNDS, MOST_STEPS, SETTLED = 8, 12, 0.02
+MOST_ROUNDS, MOST_STEPS, SETTLED = 6, 5, 0.1
 """Largest numbers of rounds and of solver steps per round, and the change of every number at which
 rounds end [std]."""
+RECUT_S = 0.02
+"""Change of the lag after which wheel turns are computed anew [s]."""
 NOISE_TRACKS = 12
 """Largest number of runs on each floor from which variances are estimated."""
-_TYPICAL = np.log(np.array([0.003, 0.005, 0.01, 0.01, 0.02]) ** 2)
-"""Logarithms of the typical variances of positions, headings, and of the motion along, across and
-in yaw per metre."""
+_TYPICAL = np.log(np.array([0.003, 0.005, 0.005, 0.005, 0.01, 0.005, 0.005, 0.01]) ** 2)
+"""Logarithms of the typical variances of positions, of headings, of the motion along, across and in
+yaw per metre, and of a run's effects on them."""
 _TYPICAL_STD = 3.0
 """Prior std of the logarithms of variances [1]."""
 
@@ -109,11 +115,14 @@ class MotionNoise:
         heading: std of a logged heading [rad].
         process: std of the motion along, across and in yaw on each floor [m/sqrt(m), m/sqrt(m),
             rad/sqrt(m)].
+        effect: std of a run's constant errors along, across and in yaw per distance, keyed by floor
+            [m/m, m/m, rad/m].
     """
 
     place: float
     heading: float
     process: Mapping[str, tuple[float, float, float]]
+    effect: Mapping[str, tuple[float, float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,11 +203,10 @@ class Calibration:
 
 @dataclass(frozen=True)
 class _Number:
-    """One coordinate of the search vector: its Gaussian prior, and the step of derivatives."""
+    """Gaussian prior of one coordinate of the search vector; a std of 0 fixes it."""
 
     mean: float
     std: float
-    step: float = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +218,7 @@ class _Model:
         floors, sessions: names of floors and sessions.
         firmest: index of the floor to which radii refer.
         numbers: coordinates of the search vector, keyed by name.
+        unseen: names of coordinates that no run shows, and that stay at their prior means.
     """
 
     space: Space
@@ -217,6 +226,7 @@ class _Model:
     sessions: tuple[str, ...]
     firmest: int
     numbers: Mapping[str, _Number]
+    unseen: frozenset[str]
 
     @classmethod
     def of(cls, space: Space, choices: Sequence[Choice], data: Runs, firmest: int) -> "_Model":
@@ -240,41 +250,73 @@ class _Model:
         numbers["yaw"] = _given(space, choices, "camera.marker_yaw", YAW_STD)
         if len(sessions) > 1:
             numbers |= {f"yaw@{s}": _Number(0.0, SESSION_STD) for s in sessions}
-        numbers["lag"] = replace(_given(space, choices, "camera.lag", LAG_STD), step=1e-3)
+        numbers["lag"] = _given(space, choices, "camera.lag", LAG_STD)
         numbers["scale"] = scale
-        return cls(space, floors, sessions, firmest, numbers)
+        straight = set(floors) - _floors_with_turns(space, data)
+        unseen = {f"{what}.{f}" for f in straight for what in ("base", "centre")} & set(numbers)
+        return cls(space, floors, sessions, firmest, numbers, frozenset(unseen))
 
-    @property
+    @cached_property
     def free(self) -> list[str]:
         """Names of the coordinates that are fitted."""
-        return [name for name, number in self.numbers.items() if number.std > 0]
+        return [n for n, number in self.numbers.items() if number.std > 0 and n not in self.unseen]
 
     def column(self, name: str, z: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch"]:
         """Return one coordinate of search vectors, or its given value if it is not fitted."""
         if name not in self.numbers:
             return np.zeros(z.shape[:-1])
-        if (number := self.numbers[name]).std > 0:
+        if name in self.free:
             return np.asarray(z[..., self.free.index(name)])
-        return np.full(z.shape[:-1], number.mean)
+        return np.full(z.shape[:-1], self.numbers[name].mean)
 
-    def log_radius(self, floor: int, drive: int, z: np.ndarray) -> Float[np.ndarray, "*batch"]:
-        """Return the logarithm of an effective radius over that of the config."""
-        own = self.column(f"drive.{drive}", z) + self.column(f"floor.{self.floors[floor]}", z)
-        return np.asarray(self.column("radius", z) + own)
-
-    def kinematics(self, z: Float[np.ndarray, " free"]) -> Kinematics:
-        """Return the kinematics at a search vector."""
+    @cached_property
+    def has_centre(self) -> bool:
+        """True if floors differ in the point about which the robot turns."""
         shape = self.space.template.geometry
-        base, drives = nominal_base(shape), range(shape.drives)
-        radius = [[self.log_radius(k, j, z) for j in drives] for k in range(len(self.floors))]
+        return not shape.determines_twist and not is_axle(shape)
+
+    def kinematics(self, z: Float[np.ndarray, "*batch free"]) -> Kinematics:
+        """Return the kinematics at a search vector; for several, arrays have leading axes."""
+        shape, floors = self.space.template.geometry, self.floors
+        radius = [
+            [self.column(f"drive.{j}", z) + self.column(f"floor.{f}", z) for j in range(shape.drives)]
+            for f in floors
+        ]
+        common = self.column("radius", z)[..., None, None]
+        base = np.stack([self.column(f"base.{f}", z) for f in floors], axis=-1)
         return Kinematics(
-            self.floors,
-            np.asarray(shape.pseudo_inverse()),
-            base,
-            float(shape.wheel_radius) * np.exp(np.array(radius)),
-            base * np.exp([float(self.column(f"base.{f}", z)) for f in self.floors]),
-            np.array([float(self.column(f"centre.{f}", z)) for f in self.floors]),
+            floors,
+            self.rolling,
+            self.nominal_base,
+            float(shape.wheel_radius) * np.exp(common + np.moveaxis(np.array(radius), (0, 1), (-2, -1))),
+            self.nominal_base * np.exp(base),
+            np.stack([self.column(f"centre.{f}", z) for f in floors], axis=-1),
         )
+
+    def matrices(self, z: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch floor 3 drive"]:
+        """Return the matrices from wheel turns to body increments on every floor."""
+        return self.kinematics(z).matrices()
+
+    @cached_property
+    def rolling(self) -> Float[np.ndarray, "3 drive"]:
+        """Pseudo-inverse of the config's geometry."""
+        return np.asarray(self.space.template.geometry.pseudo_inverse())
+
+    @cached_property
+    def nominal_base(self) -> float:
+        """Track or base of the config's geometry [m]."""
+        return nominal_base(self.space.template.geometry)
+
+
+def _floors_with_turns(space: Space, data: Runs) -> set[str]:
+    """Return the floors on which the wheels turned the robot in some run."""
+    shape = space.template.geometry
+    yaw = np.asarray(shape.pseudo_inverse())[2] * float(shape.wheel_radius)
+    turned: dict[str, list[float]] = {}
+    for k, log in enumerate(data.logs):
+        heading = data.wheel_angle[data.rows(k)] @ yaw
+        turned.setdefault(log.surface or "unknown", []).append(float(np.ptp(heading)))
+    return {f for f, x in turned.items() if max(x) > WHOLE_TURN or np.mean(x) > MEAN_TURN}
 
 
 def _is_fixed(choices: Sequence[Choice], path: str) -> bool:
@@ -300,82 +342,66 @@ class _Fit:
 
     Attributes:
         model: map from the search vector.
+        data: the runs.
         tracks: poses and wheel turns.
         z: search vector.
-        log_variance: logarithms of the variances: positions, headings, then motion by floor.
-        weight: weight of each run [1].
+        log_variance: logarithms of the variances: of positions and headings, then for each floor
+            six of the motion, as in `innovations`.
+        weight: weight of each track [1].
     """
 
     model: _Model
+    data: Runs
     tracks: PoseTracks
     z: Float[np.ndarray, " free"]
     log_variance: Float[np.ndarray, " variance"]
-    weight: Float[np.ndarray, " run"]
-    turn_cache: dict[float, np.ndarray] = field(default_factory=dict)
+    weight: Float[np.ndarray, " track"]
 
     @cached_property
-    def floor(self) -> Int[np.ndarray, " run"]:
-        """Index of the floor of each track."""
-        logs = self.tracks.data.logs
-        names = [logs[k].surface or "unknown" for k in self.tracks.run]
-        return np.array([self.model.floors.index(name) for name in names])
+    def floor(self) -> Int[np.ndarray, " track"]:
+        """Index of the floor of each track; 0 for tracks that only fill the arrays."""
+        names = [self.data.logs[k].surface or "unknown" for k in self.tracks.run]
+        return self._filled([self.model.floors.index(name) for name in names])
 
     @cached_property
-    def session(self) -> Int[np.ndarray, " run"]:
+    def session(self) -> Int[np.ndarray, " track"]:
         """Index of the session of each track."""
-        names = [self.tracks.data.session[k] for k in self.tracks.run]
-        return np.array([self.model.sessions.index(name) for name in names])
+        names = [self.data.session[k] for k in self.tracks.run]
+        return self._filled([self.model.sessions.index(name) for name in names])
 
-    def turned(self, lag: float) -> np.ndarray:
-        if lag not in self.turn_cache:
-            self.turn_cache.clear()
-            self.turn_cache[lag] = self.tracks.turned(lag)
-        return self.turn_cache[lag]
+    def _filled(self, of_runs: list[int]) -> Int[np.ndarray, " track"]:
+        return np.pad(of_runs, (0, len(self.tracks.pose) - len(of_runs)))
 
-    def motion(self, z: Float[np.ndarray, " free"]) -> Float[np.ndarray, "run gap 3"]:
-        """Return the predicted motion between poses."""
-        matrix = self.model.kinematics(z).matrices()[self.floor]
-        lag = float(self.model.column("lag", z))
-        own = float(self.model.column("lag", self.z))
-        turn = self.turned(own) if lag == own else self.tracks.turned(lag)
-        return moved(matrix, turn)
-
-    def sensor(self, z: Float[np.ndarray, "variant free"]) -> Sensor:
+    def motion(self, z: Float[np.ndarray, "*batch free"]) -> Motion:
+        """Return the numbers by which the poses of every track are predicted."""
         model = self.model
-        place = np.stack([model.column(f"offset.{axis}", z) for axis in "xy"], axis=-1)
         each = np.stack([model.column(f"yaw@{s}", z) for s in model.sessions], axis=-1)
-        yaw = model.column("yaw", z)[:, None] + each[:, self.session]
-        return Sensor(place[:, None], yaw, model.column("scale", z)[:, None])
+        each = each[..., self.session]
 
-    def noise(self, log_variance: Float[np.ndarray, "variant variance"]) -> Noise:
-        v = np.exp(log_variance)
-        process = v[:, 2:].reshape(len(v), -1, 3)[:, self.floor]
-        return Noise(v[:, :1], v[:, 1:2], process)
+        def for_all(name: str) -> np.ndarray:
+            return np.broadcast_to(model.column(name, z)[..., None], each.shape)
 
-    def innovations(
-        self, z: Float[np.ndarray, "variant free"], log_variance: np.ndarray
-    ) -> Innovations:
-        """Return the innovations at several search vectors, or at several sets of variances."""
-        first = self.motion(z[0])
-        # Coordinates of the sensor do not change the predicted motion.
-        same = [name.startswith(("offset", "yaw", "scale")) for name in self.model.free]
-        motion = np.stack(
-            [
-                first if k == 0 or not (row != z[0])[~np.array(same, bool)].any()
-                else self.motion(row)
-                for k, row in enumerate(z)
-            ]
-        )  # fmt: skip
-        arm = 0.5 * nominal_base(self.model.space.template.geometry)
-        start = aligned_headings(self.tracks.pose, first) + self.sensor(z[:1]).yaw[0]
-        return innovations(
-            self.tracks.pose,
-            motion,
-            self.sensor(z),
-            self.noise(np.atleast_2d(log_variance)),
-            arm,
-            start,
+        place = np.stack([for_all("offset.x"), for_all("offset.y")], axis=-1)
+        return Motion(
+            matrix=model.matrices(z)[..., self.floor, :, :],
+            place=place,
+            yaw=for_all("yaw") + each,
+            scale=for_all("scale"),
+            lag=for_all("lag") - self.tracks.lag,
         )
+
+    def log_noise(self, log_variance: Float[np.ndarray, " variance"]) -> np.ndarray:
+        """Return the logarithms of the variances of every track (track, 8)."""
+        motion = log_variance[2:].reshape(-1, 6)[self.floor]
+        return np.concatenate([np.tile(log_variance[:2], (len(motion), 1)), motion], axis=1)
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """Arrays of the tracks for the compiled functions."""
+        t, now = self.tracks, self.motion(self.z)
+        turn = t.turn + now.lag[:, None, None, None] * t.turn_slope
+        heading = np.asarray(start_headings(now.matrix, t.pose, turn)) + now.yaw
+        return t.pose, t.turn, t.turn_slope, t.far, heading
 
     @cached_property
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
@@ -383,76 +409,105 @@ class _Fit:
         each = [self.model.numbers[name] for name in self.model.free]
         return np.array([n.mean for n in each]), np.array([n.std for n in each])
 
-    def linear(self) -> tuple[Float[np.ndarray, "run m"], Float[np.ndarray, "run m free"]]:
-        """Return weighted whitened residuals of every run, and their derivative."""
-        step = np.array([self.model.numbers[name].step for name in self.model.free])
-        z = self.z + np.concatenate([np.zeros((1, len(step))), np.diag(step)])
-        white = self.innovations(z, self.log_variance).white
-        white = white.reshape(*white.shape[:2], -1) * np.sqrt(self.weight)[:, None]
-        return white[0], np.moveaxis((white[1:] - white[0]) / step[:, None, None], 0, -1)
+    @cached_property
+    def linear(self) -> tuple[Float[np.ndarray, "track m"], Float[np.ndarray, "track m free"]]:
+        """Weighted whitened residuals of every track, and their derivative."""
+        now, log_noise = self.motion(self.z), self.log_noise(self.log_variance)
+        white, slope = linear_innovations(now, log_noise, self.arrays)
+        free, step = len(self.z), 1e-6
+        moved = self.motion(self.z + step * np.eye(free))
+        total = np.zeros((*white.shape, free))
+        for field, before, after in zip(slope, now, moved, strict=True):
+            by_z = (after - before) / step
+            shape = *white.shape, -1
+            by_field = np.asarray(field).reshape(shape)
+            total += np.einsum("ngaf,znf->ngaz", by_field, by_z.reshape(free, len(white), -1))
+        root = np.sqrt(self.weight)[:, None]
+        tracks = len(white)
+        return (
+            np.asarray(white).reshape(tracks, -1) * root,
+            total.reshape(tracks, -1, free) * root[..., None],
+        )
 
     def loss(self, z: Float[np.ndarray, " free"]) -> float:
-        """Return minus twice the log posterior of the search vector at the present variances."""
-        at = self.innovations(z[None], self.log_variance)
+        """Return the sum of squares at a search vector, with the present path's filter gains."""
+        now, log_noise = self.motion(self.z), self.log_noise(self.log_variance)
+        white = np.asarray(innovations(self.motion(z), now, log_noise, self.arrays).white)
         mean, std = self.prior
-        each = (at.white[0] ** 2).sum(axis=(1, 2)) + at.log_variance[0]
-        return float((self.weight * each).sum() + (((z - mean) / std) ** 2).sum())
+        each = self.weight * (white**2).sum(axis=(1, 2))
+        return float(each.sum() + (((z - mean) / std) ** 2).sum())
+
+    @property
+    def gradient(self) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
+        """Gradient and Gauss-Newton matrix of half the sum of squares, prior included."""
+        (r, slope), (mean, std) = self.linear, self.prior
+        matrix = np.einsum("nmi,nmj->ij", slope, slope) + np.diag(std**-2.0)
+        return np.einsum("nmi,nm->i", slope, r) + (self.z - mean) / std**2, matrix
 
     def solved(self) -> "_Fit":
         """Return the fit with the search vector solved by Levenberg and Marquardt."""
-        now, damping, loss = self, 1e-3, self.loss(self.z)
-        mean, std = self.prior
+        now, damping = self, 1e-4
         for _ in range(MOST_STEPS):
-            r, slope = now.linear()
-            a = np.einsum("nmi,nmj->ij", slope, slope) + np.diag(std**-2.0)
-            g = np.einsum("nmi,nm->i", slope, r) + (now.z - mean) / std**2
+            g, a = now.gradient
+            loss = now.loss(now.z)
             for _ in range(8):
                 step = np.linalg.solve(a + damping * np.diag(np.diag(a)), -g)
-                new = now.loss(now.z + step)
-                if new < loss + 1e-9 * abs(loss):
+                if now.loss(now.z + step) <= loss * (1 + 1e-9):
                     break
                 damping *= 10.0
             else:
                 return now
-            size = np.abs(step) / np.sqrt(np.diag(np.linalg.inv(a)))
-            now, loss, damping = replace(now, z=now.z + step, turn_cache={}), new, damping * 0.1
-            if size.max() < 0.5 * SETTLED:
+            now, damping = replace(now, z=now.z + step), damping * 0.1
+            if _in_stds(step, a) < SETTLED:
                 break
         return now
 
     def with_noise(self) -> "_Fit":
-        """Return the fit with variances of largest posterior, from some of the runs."""
-        some = np.concatenate([
-            mine[np.unique(np.linspace(0, len(mine) - 1, NOISE_TRACKS).round().astype(int))]
-            for k in range(len(self.model.floors))
-            if len(mine := np.flatnonzero(self.floor == k))
-        ])  # fmt: skip
-        part = replace(
-            self, tracks=self.tracks.subset(some), weight=self.weight[some], turn_cache={}
-        )
+        """Return the fit with variances of largest posterior, from some of the tracks."""
+        some = []
+        for k in range(len(self.model.floors)):
+            mine = np.flatnonzero(self.floor[: len(self.tracks.run)] == k)
+            at = np.linspace(0, len(mine) - 1, min(NOISE_TRACKS, len(mine)))
+            some.append(mine[at.round().astype(int)])
+        part = self.of_tracks(np.concatenate(some))
         typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:], len(self.model.floors))])
-        step = 1e-3
+        numbers = part.motion(self.z)
 
         def loss(v: np.ndarray) -> tuple[float, np.ndarray]:
-            each = v + np.concatenate([np.zeros((1, len(v))), step * np.eye(len(v))])
-            at = part.innovations(np.tile(self.z, (len(each), 1)), each)
-            whole = (part.weight * ((at.white**2).sum(axis=(2, 3)) + at.log_variance)).sum(axis=1)
-            whole = whole + (((each - typical) / _TYPICAL_STD) ** 2).sum(axis=1)
-            return float(whole[0]), (whole[1:] - whole[0]) / step
+            each, slope = loss_of_noise(numbers, part.log_noise(v), part.arrays)
+            slope = np.asarray(slope) * part.weight[:, None]
+            motion = np.zeros((len(self.model.floors), 6))
+            np.add.at(motion, part.floor, slope[:, 2:])
+            pull = (v - typical) / _TYPICAL_STD
+            total = float((part.weight * np.asarray(each)).sum() + (pull**2).sum())
+            own = np.concatenate([slope[:, :2].sum(axis=0), motion.ravel()])
+            return total, own + 2 * pull / _TYPICAL_STD
 
+        bounds = [(x - 12.0, x + 12.0) for x in typical]
         found = minimize(
-            loss, self.log_variance, jac=True, method="L-BFGS-B",
-            bounds=[(t - 12.0, t + 12.0) for t in typical], options={"maxiter": 25, "ftol": 1e-6},
-        )  # fmt: skip
-        return replace(self, log_variance=found.x, turn_cache={})
+            loss,
+            self.log_variance,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+            options={"maxiter": 20, "ftol": 1e-6},
+        )
+        return replace(self, log_variance=found.x)
+
+    def of_tracks(self, tracks: Int[np.ndarray, " some"]) -> "_Fit":
+        """Return the fit of some of the tracks."""
+        part = self.tracks.subset(tracks)
+        weight = np.pad(self.weight[tracks], (0, len(part.pose) - len(tracks)))
+        return replace(self, tracks=part, weight=weight)
 
     def with_weights(self) -> "_Fit":
-        """Return the fit with the Student-t weight of every run."""
-        at = self.innovations(self.z[None], self.log_variance)
-        square = (at.white[0] ** 2).sum(axis=(1, 2))
-        # A run counts as one observation of variance: long runs are not more robust.
-        each = square / np.maximum(at.count, 1)
-        return replace(self, weight=(DEGREES + 1) / (DEGREES + each), turn_cache={})
+        """Return the fit with the Student-t weight of every track."""
+        now, log_noise = self.motion(self.z), self.log_noise(self.log_variance)
+        white = np.asarray(innovations(now, now, log_noise, self.arrays).white)
+        count = np.maximum(np.isfinite(self.tracks.pose[:, 1:]).sum(axis=(1, 2)), 1)
+        # The mean square of a run counts as one observation: a long run may be an outlier, too.
+        each = (white**2).sum(axis=(1, 2)) / count
+        return replace(self, weight=(DEGREES + 1) / (DEGREES + each))
 
 
 def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calibration:
@@ -468,116 +523,116 @@ def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calib
         DataError: no run has two poses.
     """
     model = _Model.of(space, choices, data, 0)
-    mean = np.array([model.numbers[name].mean for name in model.free])
+    z = np.array([model.numbers[name].mean for name in model.free])
     lag = pose_lag(data)
     if "lag" in model.free and lag is not None and lag.decisive:
-        mean[model.free.index("lag")] = lag.seconds
-    floors = len(model.floors)
-    log_variance = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:] + 2.0, floors)])
-    fit = _started(model, data, mean, log_variance)
+        z[model.free.index("lag")] = lag.seconds
+    typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:] + 2.0, len(model.floors))])
+    fit = _started(model, data, z, typical)
     for _ in range(MOST_ROUNDS):
         before = fit
         fit = fit.solved().with_noise().with_weights()
         radius = [float(np.mean(row)) for row in fit.model.kinematics(fit.z).radius]
-        fit = _referred(fit, data, choices, int(np.argmax(radius)))
-        at = float(fit.model.column("lag", fit.z))
-        if abs(at - float(before.model.column("lag", before.z))) > 0.02:
-            fit = replace(fit, tracks=PoseTracks.of(data, at), turn_cache={})
-            fit = replace(fit, weight=np.ones(len(fit.tracks.run)), turn_cache={})
-            continue
-        if fit.model.firmest == before.model.firmest:
-            _, covariance, _ = _uncertainty(fit)
-            change = np.abs(fit.z - before.z) / np.sqrt(np.diag(covariance))
-            if change.max() < SETTLED:
+        fit = _referred(fit, choices, int(np.argmax(radius)))
+        if abs(float(fit.model.column("lag", fit.z)) - fit.tracks.lag) > RECUT_S:
+            fit = _cut(fit)
+        elif fit.model.firmest == before.model.firmest:
+            if _in_stds(fit.z - before.z, fit.gradient[1]) < SETTLED:
                 break
+    global LAST
+    LAST = fit
     return _result(fit, len(data))
+
+
+def _in_stds(change: Float[np.ndarray, " free"], precision: Float[np.ndarray, "free free"]) -> float:
+    """Return the largest change of a coordinate, in its standard deviations."""
+    return float((np.abs(change) / np.sqrt(np.diag(np.linalg.inv(precision)))).max())
+
+
+def _cut(fit: _Fit) -> _Fit:
+    """Return the fit with the tracks cut at the present lag."""
+    shape = fit.model.space.template.geometry
+    nominal = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
+    arm, lag = 0.5 * nominal_base(shape), float(fit.model.column("lag", fit.z))
+    tracks = pose_tracks(fit.data, lag, nominal, arm)
+    return replace(fit, tracks=tracks, weight=np.ones(len(tracks.pose)))
 
 
 def _started(model: _Model, data: Runs, z: np.ndarray, log_variance: np.ndarray) -> _Fit:
     """Return the fit before its first round, with the sensor's yaw estimated from directions."""
-    tracks = PoseTracks.of(data, float(model.column("lag", z)))
-    fit = _Fit(model, tracks, z, log_variance, np.ones(len(tracks.run)))
-    if "yaw" in model.free and not np.isnan(tracks.pose[..., 2]).all():
-        motion, pose = fit.motion(z), tracks.pose
-        seen = np.diff(pose[..., 0] + 1j * pose[..., 1], axis=1) * np.exp(-1j * pose[:, :-1, 2])
-        product = seen * (motion[..., 0] - 1j * motion[..., 1])
-        z = z.copy()
-        z[model.free.index("yaw")] = -np.angle(np.nansum(product))
-        fit = replace(fit, z=z, turn_cache={})
-    return fit
+    nothing = np.zeros(0)
+    empty = PoseTracks(np.zeros(0, int), nothing, nothing, nothing, nothing, 0.0)
+    fit = _cut(_Fit(model, data, empty, z, log_variance, np.ones(0)))
+    tracks = fit.tracks
+    if "yaw" not in model.free or not np.isfinite(tracks.pose).all(axis=-1).any():
+        return fit
+    z = z.copy()
+    z[model.free.index("yaw")] = sensor_yaw(fit.motion(z).matrix, tracks.pose, tracks.turn)
+    return replace(fit, z=z)
 
 
-def _referred(fit: _Fit, data: Runs, choices: Sequence[Choice], firmest: int) -> _Fit:
-    """Return the fit with radii and centres that refer to another floor, if it is the firmest."""
+def _referred(fit: _Fit, choices: Sequence[Choice], firmest: int) -> _Fit:
+    """Return the fit with radii and centres that refer to the floor with index `firmest`."""
     if firmest == fit.model.firmest:
         return fit
-    model = _Model.of(fit.model.space, choices, data, firmest)
-    kept = {name: float(fit.model.column(name, fit.z)) for name in model.free}
-    own, far = fit.model.floors[firmest], fit.model.floors
-    shift = float(fit.model.column(f"floor.{own}", fit.z))
-    turned_about = float(fit.model.column(f"centre.{own}", fit.z))
-    for name in far:
-        if f"floor.{name}" in kept:
-            kept[f"floor.{name}"] -= shift
-        if f"centre.{name}" in kept:
-            kept[f"centre.{name}"] -= turned_about
-    kept["offset.x"] = kept.get("offset.x", 0.0) - turned_about
-    if "radius" in kept:
-        kept["radius"] += shift
-    z = np.array([kept[name] for name in model.free])
-    return replace(fit, model=model, z=z, turn_cache={})
+    model = _Model.of(fit.model.space, choices, fit.data, firmest)
+    own = fit.model.floors[firmest]
+
+    def before(name: str) -> float:
+        return float(fit.model.column(name, fit.z))
+
+    longer, ahead = before(f"floor.{own}"), before(f"centre.{own}")
+    shift = {"radius": longer, "offset.x": -ahead}
+    shift |= {f"floor.{f}": -longer for f in model.floors}
+    shift |= {f"centre.{f}": -ahead for f in model.floors}
+    z = np.array([before(name) + shift.get(name, 0.0) for name in model.free])
+    return replace(fit, model=model, z=z)
 
 
-def _uncertainty(fit: _Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return precision, covariance and the jackknife's change of the vector for every cluster."""
-    r, slope = fit.linear()
-    mean, std = fit.prior
-    per_run = max(1, int(np.ceil(LEAST_CLUSTERS / len(r))))
-    gaps = fit.tracks.pose.shape[1]
-    part = np.minimum(np.arange(gaps) * per_run // gaps, per_run - 1)
-    part = np.repeat(part, 3)
-    a = np.einsum("nmi,nmj->ij", slope, slope) + np.diag(std**-2.0)
-    changes = []
-    for n in range(len(r)):
-        for k in range(per_run):
+def _changes(fit: _Fit) -> Float[np.ndarray, "part free"]:
+    """Return the change of the search vector if one part of the runs is left out (jackknife).
+
+    Parts are runs, or equal parts of runs if there are few.
+    """
+    (r, slope), (_, a) = fit.linear, fit.gradient
+    runs = len(fit.tracks.run)
+    parts = max(1, int(np.ceil(LEAST_CLUSTERS / runs)))
+    out = []
+    for n in range(runs):
+        used = max(int(np.isfinite(fit.tracks.pose[n, 1:]).any(axis=1).sum()), 1)
+        part = np.repeat(np.minimum(np.arange(r.shape[1] // 3) * parts // used, parts - 1), 3)
+        for k in range(parts):
             mine = slope[n][part == k]
-            g = mine.T @ r[n][part == k]
-            changes.append(np.linalg.solve(a - mine.T @ mine, g))
-    return a, np.linalg.inv(a), np.array(changes)
+            out.append(np.linalg.solve(a - mine.T @ mine, mine.T @ r[n][part == k]))
+    return np.array(out)
 
 
 def _result(fit: _Fit, runs: int) -> Calibration:
     """Return the calibration with intervals and verdicts."""
     model, z = fit.model, fit.z
-    precision, covariance, changes = _uncertainty(fit)
-    _, prior_std = fit.prior
+    covariance, changes = np.linalg.inv(fit.gradient[1]), _changes(fit)
     count = len(changes)
     off = changes - changes.mean(axis=0)
 
-    def value(
-        weights: Mapping[str, float], unit: str, centre: float = 0.0, log_of: float | None = None
-    ) -> Value:
-        """Return a sum of coordinates with its interval; of its exponential times `log_of`."""
-        w = np.array([weights.get(name, 0.0) for name in model.free])
-        at = centre + sum(x * float(model.column(name, z)) for name, x in weights.items())
-        if not w.any():
-            best = at if log_of is None else log_of * float(np.exp(at))
-            return Value(best, (best, best), 0.0, "fixed", unit)
-        model_var = float(w @ covariance @ w)
+    def value(names: Sequence[str], unit: str, log_of: float | None = None) -> Value:
+        """Return the sum of some coordinates, or the exponential of the sum, times `log_of`."""
+        w = np.array([float(name in names) for name in model.free])
+        prior = float(np.hypot.reduce([model.numbers[name].std for name in names if name in model.numbers], initial=0.0))
+        at = sum(float(model.column(name, z)) for name in names)
         influence = (off @ w) ** 2
         jackknife = (count - 1) / count * float(influence.sum())
-        std = float(np.sqrt(max(model_var, jackknife)))
+        std = float(np.sqrt(max(float(w @ covariance @ w), jackknife))) if w.any() else prior
         share = influence / max(float(influence.sum()), 1e-300)
-        freedom = max(1 / float((share**2).sum()) - 1, 3.0)
+        freedom = max(1 / max(float((share**2).sum()), 1e-9) - 1, 3.0)
         half = std * float(student.ppf(0.95, freedom))
-        prior = float(np.sqrt(((w * prior_std) ** 2).sum()))
-        ratio = std / prior
-        verdict: Verdict = (
-            "identified" if ratio < IDENTIFIED else "weak" if ratio < WEAK else "not_identified"
-        )
+        verdict: Verdict = "fixed" if prior == 0 else "identified"
+        if prior > 0 and std > IDENTIFIED * prior:
+            verdict = "weak" if w.any() and std < WEAK * prior else "not_identified"
+        ends = at - half, at + half
         if log_of is None:
-            return Value(at, (at - half, at + half), std, verdict, unit)
-        low, best, high = (log_of * float(np.exp(x)) for x in (at - half, at, at + half))
+            return Value(at, ends, std, verdict, unit)
+        best = log_of * float(np.exp(at))
+        low, high = (log_of * float(np.exp(end)) for end in ends)
         return Value(best, (low, high), best * std, verdict, unit)
 
     shape = model.space.template.geometry
@@ -587,22 +642,20 @@ def _result(fit: _Fit, runs: int) -> Calibration:
         sideways=shape.determines_twist,
         radius={
             f: tuple(
-                value({"radius": 1.0, f"drive.{j}": 1.0, f"floor.{f}": 1.0}, "m", log_of=radius)
+                value(["radius", f"drive.{j}", f"floor.{f}"], "m", radius)
                 for j in range(shape.drives)
             )
             for f in model.floors
         },
-        base={f: value({f"base.{f}": 1.0}, "m", log_of=base) for f in model.floors},
+        base={f: value([f"base.{f}"], "m", base) for f in model.floors},
         centre={
-            f: value({f"centre.{f}": 1.0}, "m")
-            for f in model.floors
-            if f"centre.{f}" in model.numbers
+            f: value([f"centre.{f}"], "m") for f in model.floors if model.has_centre
         },
-        offset=(value({"offset.x": 1.0}, "m"), value({"offset.y": 1.0}, "m")),
-        yaw=value({"yaw": 1.0}, "rad"),
+        offset=(value(["offset.x"], "m"), value(["offset.y"], "m")),
+        yaw=value(["yaw"], "rad"),
         session_yaw={s: float(model.column(f"yaw@{s}", z)) for s in model.sessions},
-        lag=value({"lag": 1.0}, "s"),
-        scale=value({"scale": 1.0}, "1"),
+        lag=value(["lag"], "s"),
+        scale=value(["scale"], "1"),
         firmest=model.floors[model.firmest],
         nominal_radius=radius,
         nominal_base=base,
@@ -613,6 +666,9 @@ def _result(fit: _Fit, runs: int) -> Calibration:
 
 def _noise(fit: _Fit) -> MotionNoise:
     std = np.exp(0.5 * fit.log_variance)
-    process = std[2:].reshape(-1, 3).tolist()
-    each = {f: (a, b, c) for f, (a, b, c) in zip(fit.model.floors, process, strict=True)}
-    return MotionNoise(float(std[0]), float(std[1]), each)
+    floors = std[2:].reshape(-1, 2, 3)
+    process, effect = (
+        {f: (a, b, c) for f, (a, b, c) in zip(fit.model.floors, each.tolist(), strict=True)}
+        for each in (floors[:, 0], floors[:, 1])
+    )
+    return MotionNoise(float(std[0]), float(std[1]), process, effect)

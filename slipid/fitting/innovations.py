@@ -1,24 +1,28 @@
 """Whitened innovations of measured poses, given the motion that kinematics predict.
 
-The body pose g = (x, y, heading) of a run follows the predicted motion, with process noise that
-grows with the distance, and the pose sensor measures some of its coordinates:
+The body pose g = (x, y, heading) of a run follows the predicted motion, with an effect of the run
+and with process noise, and the pose sensor measures some of its coordinates:
 
-    g_(k+1) = g_k * D_k * noise,   z_k = h(g_k) + noise,   h(g) = g * (p, psi)
+    g_(k+1) = g_k * (D_k + e d_k + noise),   z_k = h(g_k) + noise,   h(g) = g * (p, psi)
 
-with D_k the predicted motion from pose k to pose k + 1, p the place of the sensor on the body and
-psi its yaw. An extended Kalman filter turns the measurements into innovations. Divided by their
-standard deviations they are independent, so that the sum of their squares is that of the likelihood
-of all poses of the run. Poses may lack coordinates: positions without headings (GPS), headings
-without positions (compass), or poses only at the ends of a run. The start of every run is free.
+with D_k the predicted motion from pose k to pose k + 1, d_k its length, e the run's constant errors
+along and across the direction of travel and in yaw per distance, p the place of the sensor on the
+body and psi its yaw. The variance of the noise grows with d_k. An extended Kalman filter turns the
+measurements into innovations. Divided by their standard deviations they are independent, so that
+the sum of their squares is that of the likelihood of all poses of the run. Poses may lack
+coordinates: positions without headings (GPS), headings without positions (compass), or poses only
+at the ends of a run. The start of every run is free.
 
 Source: innovations form of the likelihood, Schweppe 1965, IEEE Transactions on Information Theory.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
@@ -26,86 +30,110 @@ from slipid.support.errors import DataError
 
 POSE_PERIOD_S = 0.2
 """Shortest time between two poses that are used [s]."""
-MOST_POSES = 300
-"""Largest number of poses of a run that are used; those of longer runs are further apart."""
-SUBSTEP_S, MOST_SUBSTEPS = 0.05, 12
+MOST_POSES, LEAST_POSES, ALL_POSES = 300, 20, 12_000
+"""Largest number of poses of a run that are used, number to which it is reduced if there are many
+runs, and number of poses of all runs at which the reduction begins."""
+SUBSTEP_S, MOST_SUBSTEPS = 0.05, 4
 """Length of the steps in which the motion between two poses is computed [s], and the largest number
 of such steps."""
+LAG_STEP_S = 0.005
+"""Half the step of the derivative of wheel turns with respect to the lag [s]."""
 UNKNOWN_HEADING_STD = 0.5
 """Std of the start heading of a run without headings, which is found by aligning paths [rad]."""
 UNKNOWN_PLACE_STD = 1e3
 """Std of the start position of a run without positions [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class PoseTracks:
-    """Poses of runs in arrays of equal length, and the wheel angles between them.
+class PoseTracks(NamedTuple):
+    """Poses of runs, and the wheel turns between them, in arrays that are filled up with nan.
+
+    Arrays have a few common sizes, so that few are compiled for; runs that fill them have no pose.
 
     Attributes:
-        data: the runs.
-        run: index of each track's run.
-        time: times of the poses [s]; the last one is repeated to fill the array.
-        pose: logged poses [m, m, rad]; nan where a coordinate is unknown or the array is filled.
-        steps: number of steps in which the motion between two poses is computed.
+        run: index of the run of each track; tracks that only fill the arrays come last and have
+            none.
+        pose: logged poses [m, m, rad]; nan where a coordinate is unknown.
+        turn: wheel turns in the steps between poses at the lag `lag` [rad].
+        turn_slope: their derivative with respect to the lag [rad/s].
+        far: distance between poses, with which errors of the motion grow [m].
+        lag: lag of the poses for which the turns were computed [s].
     """
 
-    data: Runs
     run: Int[np.ndarray, " run"]
-    time: Float[np.ndarray, "run pose"]
-    pose: Float[np.ndarray, "run pose 3"]
-    steps: int
-
-    @classmethod
-    def of(cls, data: Runs, lag: float) -> "PoseTracks":
-        """Return the poses of runs whose true times, earlier by `lag` [s], have wheel angles.
-
-        Raises:
-            DataError: no run has two such poses.
-        """
-        tracks = [_picked(data, k, lag) for k in range(len(data))]
-        kept = [k for k, rows in enumerate(tracks) if len(rows) > 1]
-        if not kept:
-            raise DataError(
-                f"{data.logs[0].name}: no two poses with wheel angles at the same time, in this "
-                "run and in all others"
-            )
-        longest = max(len(tracks[k]) for k in kept)
-        time = np.empty((len(kept), longest))
-        pose = np.full((len(kept), longest, 3), np.nan)
-        for n, k in enumerate(kept):
-            rows, count = tracks[k], len(tracks[k])
-            time[n, :count] = data.time[data.rows(k)][rows]
-            time[n, count:] = time[n, count - 1]
-            pose[n, :count] = data.pose[data.rows(k)][rows]
-        between = np.diff(time, axis=1)
-        usual = float(np.median(between[between > 0]))
-        steps = int(np.clip(np.ceil(usual / SUBSTEP_S), 1, MOST_SUBSTEPS))
-        return cls(data, np.array(kept), time, pose, steps)
+    pose: Float[np.ndarray, "track pose 3"]
+    turn: Float[np.ndarray, "track gap step drive"]
+    turn_slope: Float[np.ndarray, "track gap step drive"]
+    far: Float[np.ndarray, "track gap"]
+    lag: float
 
     def subset(self, tracks: Int[np.ndarray, " some"]) -> "PoseTracks":
-        """Return the tracks with the given indices."""
-        return PoseTracks(
-            self.data, self.run[tracks], self.time[tracks], self.pose[tracks], self.steps
+        """Return some of the tracks."""
+        fill = _size(len(tracks)) - len(tracks)
+        rows = np.concatenate([tracks, np.full(fill, tracks[0])])
+        pose = self.pose[rows]
+        pose[len(tracks) :] = np.nan
+        turn, slope, far = self.turn[rows], self.turn_slope[rows], self.far[rows]
+        return PoseTracks(self.run[tracks], pose, turn, slope, far, self.lag)
+
+
+def pose_tracks(
+    data: Runs, lag: float, nominal: Float[np.ndarray, "3 drive"], arm: float
+) -> PoseTracks:
+    """Return the poses of runs whose true times, earlier by `lag` [s], have wheel angles.
+
+    Args:
+        data: the runs.
+        lag: lag of the poses behind the wheels [s].
+        nominal: matrix from wheel turns [rad] to body increments by which distances are computed.
+        arm: distance that a yaw of 1 rad counts as [m].
+
+    Raises:
+        DataError: no run has two such poses.
+    """
+    most = int(np.clip(ALL_POSES // len(data), LEAST_POSES, MOST_POSES))
+    rows = [_picked(data, k, lag, most) for k in range(len(data))]
+    kept = [k for k, picked in enumerate(rows) if len(picked) > 1]
+    if not kept:
+        raise DataError(
+            f"{data.logs[0].name}: no two poses with wheel angles at the same time, in this run "
+            "and in all others"
         )
+    count, tracks = _size(max(len(rows[k]) for k in kept) - 1), _size(len(kept))
+    time = np.zeros((tracks, count + 1))
+    pose = np.full((tracks, count + 1, 3), np.nan)
+    for n, k in enumerate(kept):
+        size = len(rows[k])
+        time[n, :size] = data.time[data.rows(k)][rows[k]]
+        time[n, size:] = time[n, size - 1]
+        pose[n, :size] = data.pose[data.rows(k)][rows[k]]
+    between = np.diff(time, axis=1)
+    steps = _size(int(np.clip(np.median(between[between > 0]) / SUBSTEP_S, 1, MOST_SUBSTEPS)))
+    part = np.arange(steps) / steps
+    at = (time[:, :-1, None] + between[..., None] * part).reshape(tracks, -1)
+    at = np.concatenate([at, time[:, -1:]], axis=1)
 
-    def turned(self, lag: float) -> Float[np.ndarray, "run gap step drive"]:
-        """Return the wheel turns [rad] in the steps between poses that lag by `lag` [s]."""
-        part = np.arange(self.steps) / self.steps
-        start, gap = self.time[:, :-1, None], np.diff(self.time, axis=1)[..., None]
-        at = np.concatenate(
-            [(start + gap * part).reshape(len(self.run), -1), self.time[:, -1:]], axis=1
-        )
-        angles = []
-        for n, k in enumerate(self.run.tolist()):
-            rows = self.data.rows(k)
-            angle = interpolate(self.data.time[rows], self.data.wheel_angle[rows], at[n] - lag)
-            angles.append(np.diff(angle, axis=0))
-        shape = len(self.run), self.time.shape[1] - 1, self.steps, -1
-        return np.stack(angles).reshape(shape)
+    def turned(lag: float) -> np.ndarray:
+        out = np.zeros((tracks, count, steps, data.wheel_angle.shape[1]))
+        for n, k in enumerate(kept):
+            of = data.rows(k)
+            angle = interpolate(data.time[of], data.wheel_angle[of], at[n] - lag)
+            out[n] = np.diff(angle, axis=0).reshape(out[n].shape)
+        return out
+
+    turn = turned(lag)
+    slope = (turned(lag + LAG_STEP_S) - turned(lag - LAG_STEP_S)) / (2 * LAG_STEP_S)
+    step = np.einsum("ad,rgsd->rga", nominal, turn)
+    far = np.hypot(step[..., 0], step[..., 1]) + arm * np.abs(step[..., 2])
+    return PoseTracks(np.array(kept), pose, turn, slope, far, lag)
 
 
-def _picked(data: Runs, run: int, lag: float) -> Int[np.ndarray, " pose"]:
-    """Return the rows of a run whose poses are used."""
+def _size(count: int) -> int:
+    """Return the power of two that is at least `count`."""
+    return 1 << max(count - 1, 0).bit_length()
+
+
+def _picked(data: Runs, run: int, lag: float, most: int) -> Int[np.ndarray, " pose"]:
+    """Return the rows of a run whose poses are used, at most `most`."""
     rows = data.rows(run)
     time, fresh = data.time[rows], np.flatnonzero(data.fresh[rows])
     fresh = fresh[np.isfinite(data.pose[rows][fresh]).any(axis=1)]
@@ -114,54 +142,27 @@ def _picked(data: Runs, run: int, lag: float) -> Int[np.ndarray, " pose"]:
     if len(fresh) < 3:
         return fresh
     t = time[fresh]
-    count = int(min(np.floor((t[-1] - t[0]) / POSE_PERIOD_S) + 1, MOST_POSES))
+    count = int(min(np.floor((t[-1] - t[0]) / POSE_PERIOD_S) + 1, most))
     at = np.searchsorted(t, np.linspace(t[0], t[-1], max(count, 2)) - 1e-9)
     return fresh[np.unique(at.clip(0, len(t) - 1))]
 
 
-def moved(
-    matrix: Float[np.ndarray, "run 3 drive"], turn: Float[np.ndarray, "run gap step drive"]
-) -> Float[np.ndarray, "run gap 3"]:
-    """Return the motion of the body between poses, relative to its pose before [m, m, rad].
-
-    `matrix` maps wheel turns to body increments; each step is an arc.
-    """
-    step = np.einsum("rad,rgsd->rgsa", matrix, turn)
-    yaw = np.cumsum(step[..., 2], axis=-1)
-    middle, chord = yaw - 0.5 * step[..., 2], np.sinc(step[..., 2] / (2 * np.pi))
-    c, s = np.cos(middle) * chord, np.sin(middle) * chord
-    x = (c * step[..., 0] - s * step[..., 1]).sum(axis=-1)
-    y = (s * step[..., 0] + c * step[..., 1]).sum(axis=-1)
-    return np.stack([x, y, yaw[..., -1]], axis=-1)
-
-
-class Sensor(NamedTuple):
-    """The pose sensor on the body, one element for each variant and run.
+class Motion(NamedTuple):
+    """Numbers by which poses of a run are predicted; with a leading axis for several tracks.
 
     Attributes:
-        place: place of the sensor ahead and to the left of the body's origin [m].
+        matrix: matrix from wheel turns [rad] to body increments [m, m, rad].
+        place: place of the pose sensor ahead and to the left of the body's origin [m].
         yaw: heading of the sensor less that of the body [rad].
         scale: true over logged length [1].
+        lag: lag of the poses less the lag of the tracks [s].
     """
 
-    place: Float[np.ndarray, "variant #run 2"]
-    yaw: Float[np.ndarray, "variant #run"]
-    scale: Float[np.ndarray, "variant #run"]
-
-
-class Noise(NamedTuple):
-    """Variances of poses and motion, one element for each variant and run.
-
-    Attributes:
-        place: variance of logged positions [m^2].
-        heading: variance of logged headings [rad^2].
-        process: variance of the motion along, across and in yaw per distance [m^2/m, m^2/m,
-            rad^2/m].
-    """
-
-    place: Float[np.ndarray, "variant #run"]
-    heading: Float[np.ndarray, "variant #run"]
-    process: Float[np.ndarray, "variant #run 3"]
+    matrix: Any
+    place: Any
+    yaw: Any
+    scale: Any
+    lag: Any
 
 
 class Innovations(NamedTuple):
@@ -170,151 +171,230 @@ class Innovations(NamedTuple):
     Attributes:
         white: innovations divided by their stds [1].
         log_variance: sum of the logarithms of their variances over each run.
-        count: number of innovations of each run.
     """
 
-    white: Float[np.ndarray, "variant run pose 3"]
-    log_variance: Float[np.ndarray, "variant run"]
-    count: Int[np.ndarray, " run"]
+    white: Float[Array, "track gap 3"]
+    log_variance: Float[Array, " track"]
 
 
-def innovations(
-    pose: Float[np.ndarray, "run pose 3"],
-    motion: Float[np.ndarray, "variant run gap 3"],
-    sensor: Sensor,
-    noise: Noise,
-    arm: float,
-    start_heading: Float[np.ndarray, " run"],
+def moved(
+    matrix: Float[Array, "3 drive"], turn: Float[Array, "gap step drive"]
+) -> Float[Array, "gap 3"]:
+    """Return the motion of the body between poses, relative to its pose before [m, m, rad].
+
+    Each step is an arc.
+    """
+    step = turn @ matrix.T
+    yaw = jnp.cumsum(step[..., 2], axis=-1)
+    middle, chord = yaw - 0.5 * step[..., 2], jnp.sinc(step[..., 2] / (2 * jnp.pi))
+    c, s = jnp.cos(middle) * chord, jnp.sin(middle) * chord
+    x = (c * step[..., 0] - s * step[..., 1]).sum(axis=-1)
+    y = (s * step[..., 0] + c * step[..., 1]).sum(axis=-1)
+    return jnp.stack([x, y, yaw[..., -1]], axis=-1)
+
+
+def _innovations(
+    numbers: Motion, reference: Motion, log_noise: Array, track: tuple[Array, ...]
 ) -> Innovations:
-    """Return the whitened innovations of all runs, for several variants at once.
+    """Return the innovations of one track; the filter's gains are those along `reference`.
 
-    If noise has a single variant, the filter's gains are computed along the path of the first
-    variant and used for all: then the innovations of all variants are whitened alike, and their
-    differences are derivatives of the residuals.
-
-    Args:
-        pose: logged poses.
-        motion: predicted motion from each pose to the next [m, m, rad].
-        sensor: the pose sensor.
-        noise: variances.
-        arm: distance that a yaw of 1 rad counts as, for process noise [m].
-        start_heading: heading of the sensor at the start of runs whose first pose has none [rad].
+    `log_noise` are the logarithms of the variances of positions [m^2], headings [rad^2], of process
+    noise along, across and in yaw per distance, and of effects along, across and in yaw.
     """
-    known = np.isfinite(pose)
-    z = np.where(known, pose, 0.0)
-    variants = max(motion.shape[0], noise.place.shape[0], sensor.yaw.shape[0])
-    runs, count = pose.shape[:2]
-    own = noise.place.shape[0]
-    state, cov = _start(z[:, 0], known[:, 0], sensor, noise, start_heading, variants)
-    white = np.zeros((variants, runs, count, 3))
-    log_variance = np.zeros((own, runs))
-    measured = np.stack([noise.place, noise.place, noise.heading])
-    px, py, scale = sensor.place[..., 0], sensor.place[..., 1], sensor.scale
-    for k in range(1, count):
-        step = motion[:, :, k - 1]
-        state, cov = _predicted(state, cov, step, noise.process, arm)
-        # derivative of the sensor's position with respect to the heading
-        c, s = np.cos(state[..., 2]), np.sin(state[..., 2])
-        ox, oy = c * px - s * py, s * px + c * py
-        gap = np.stack(
-            [
-                z[:, k, 0] - (state[..., 0] + ox) / scale,
-                z[:, k, 1] - (state[..., 1] + oy) / scale,
-                z[:, k, 2] - state[..., 2] - sensor.yaw,
-            ]
-        )
-        zero, inverse = np.zeros_like(ox[:own]), (1 / scale + 0 * ox)[:own]
-        rows = (
-            (inverse, zero, -oy[:own] * inverse),
-            (zero, inverse, ox[:own] * inverse),
-            (zero, zero, zero + 1.0),
-        )
-        change = np.zeros_like(state)
-        for axis, row in enumerate(rows):
-            seen = known[:, k, axis]
-            h = np.stack(row, axis=-1)
-            ph = np.einsum("brij,brj->bri", cov, h)
-            variance = np.where(seen, np.einsum("bri,bri->br", h, ph) + measured[axis], 1.0)
-            std = np.sqrt(variance)
-            w = np.where(seen, gap[axis] - np.einsum("bri,bri->br", h, change), 0.0) / std
-            gain = np.where(seen[:, None], ph / std[..., None], 0.0)
-            change = change + gain * w[..., None]
-            cov = cov - gain[..., :, None] * gain[..., None, :]
-            white[:, :, k, axis] = w
-            log_variance += np.where(seen, np.log(variance), 0.0)
-        state = state + change
-    return Innovations(white, log_variance, known[:, 1:].sum(axis=(1, 2)))
+    pose, turn, slope, far, start_heading = track
+    known = jnp.isfinite(pose)
+    z = jnp.where(known, pose, 0.0)
+    noise = jnp.exp(log_noise)
+    measured = jnp.stack([noise[0], noise[0], noise[1]])
 
+    def start(n: Motion) -> tuple[Array, Array]:
+        """Return the state (pose, effect) at the first pose, and the place's offset."""
+        heading = jnp.where(known[0, 2], z[0, 2], start_heading) - n.yaw
+        offset = _rotated(heading, n.place)
+        place = jnp.where(known[0, :2].all(), n.scale * z[0, :2], 0.0) - offset
+        return jnp.concatenate([place, heading[None], jnp.zeros(3)]), offset
 
-def _start(
-    z: np.ndarray,
-    known: Bool[np.ndarray, "run 3"],
-    sensor: Sensor,
-    noise: Noise,
-    start_heading: np.ndarray,
-    variants: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return body poses (variant, run, 3) and their covariances (.., run, 3, 3) at first poses."""
-    has_place, has_heading = known[:, :2].all(axis=1), known[:, 2]
-    heading = np.where(has_heading, z[:, 2], start_heading) - sensor.yaw
-    c, s = np.cos(heading), np.sin(heading)
-    ox = c * sensor.place[..., 0] - s * sensor.place[..., 1]
-    oy = s * sensor.place[..., 0] + c * sensor.place[..., 1]
-    state = np.empty((variants, len(z), 3))
-    state[..., 0] = np.where(has_place, sensor.scale * z[:, 0], 0.0) - ox
-    state[..., 1] = np.where(has_place, sensor.scale * z[:, 1], 0.0) - oy
-    state[..., 2] = heading
-    own = noise.place.shape[0]
-    place = np.where(has_place, sensor.scale[:own] ** 2 * noise.place, UNKNOWN_PLACE_STD**2)
-    turn = np.where(has_heading, noise.heading, UNKNOWN_HEADING_STD**2)
-    lever = np.stack([oy[:own], -ox[:own], np.ones_like(ox[:own])], axis=-1)
-    lever = lever + np.zeros((own, len(z), 3))
-    cov = (turn + np.zeros((own, len(z))))[..., None, None] * (
-        lever[..., :, None] * lever[..., None, :]
+    def steps(n: Motion) -> Array:
+        return moved(n.matrix, turn + n.lag * slope)
+
+    state, _ = start(numbers)
+    at, offset = start(reference)
+    lever = jnp.stack([offset[1], -offset[0], jnp.ones(()), *jnp.zeros((3,))])
+    turn_var = jnp.where(known[0, 2], noise[1], UNKNOWN_HEADING_STD**2)
+    place_var = jnp.where(
+        known[0, :2].all(), reference.scale**2 * noise[0], UNKNOWN_PLACE_STD**2
     )
-    cov[..., 0, 0] += place
-    cov[..., 1, 1] += place
-    return state, cov
+    cov = turn_var * jnp.outer(lever, lever) + jnp.diag(
+        jnp.concatenate([place_var[None], place_var[None], jnp.zeros(1), noise[5:8]])
+    )
+
+    def gap(n: Motion, state: Array, z: Array) -> Array:
+        place = (state[:2] + _rotated(state[2], n.place)) / n.scale
+        return jnp.concatenate([z[:2] - place, (z[2] - state[2] - n.yaw)[None]])
+
+    def one(carry: tuple, row: tuple) -> tuple:
+        state, at, cov = carry
+        step, at_step, z, known, far = row
+        f, q = _slope(at, at_step, far, noise[2:5])
+        state, at = _advanced(state, step, far), _advanced(at, at_step, far)
+        cov = f @ cov @ f.T + q
+        off, off_at = gap(numbers, state, z), gap(reference, at, z)
+        ox, oy = _rotated(at[2], reference.place)
+        s = 1 / reference.scale
+        h = jnp.array([[s, 0, -oy * s, 0, 0, 0], [0, s, ox * s, 0, 0, 0], [0, 0, 1, 0, 0, 0]])
+        change, change_at, white, log = jnp.zeros(6), jnp.zeros(6), [], 0.0
+        for axis in range(3):
+            seen, ph = known[axis], cov @ h[axis]
+            variance = jnp.where(seen, h[axis] @ ph + measured[axis], 1.0)
+            std = jnp.sqrt(variance)
+            gain = jnp.where(seen, ph / std, 0.0)
+            w = jnp.where(seen, off[axis] - h[axis] @ change, 0.0) / std
+            w_at = jnp.where(seen, off_at[axis] - h[axis] @ change_at, 0.0) / std
+            change, change_at = change + gain * w, change_at + gain * w_at
+            cov = cov - jnp.outer(gain, gain)
+            white.append(w)
+            log += jnp.log(variance)
+        return (state + change, at + change_at, cov), (jnp.stack(white), log)
+
+    rows = steps(numbers), steps(reference), z[1:], known[1:], far
+    _, (white, log) = jax.lax.scan(one, (state, at, cov), rows)
+    return Innovations(white, log.sum())
 
 
-def _predicted(
-    state: np.ndarray, cov: np.ndarray, step: np.ndarray, process: np.ndarray, arm: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return states and covariances after a predicted motion."""
-    c, s = np.cos(state[..., 2]), np.sin(state[..., 2])
-    dx, dy = c * step[..., 0] - s * step[..., 1], s * step[..., 0] + c * step[..., 1]
-    new = np.stack([state[..., 0] + dx, state[..., 1] + dy, state[..., 2] + step[..., 2]], axis=-1)
-    own = cov.shape[0]
-    f = np.zeros_like(cov)
-    f[..., 0, 0] = f[..., 1, 1] = f[..., 2, 2] = 1.0
-    f[..., 0, 2], f[..., 1, 2] = -dy[:own], dx[:own]
-    first = step[:own] if step.shape[0] >= own else step
-    far = np.hypot(first[..., 0], first[..., 1]) + arm * np.abs(first[..., 2])
-    middle = state[:own, :, 2] + 0.5 * first[..., 2]
-    c, s = np.cos(middle), np.sin(middle)
-    along, across, yaw = (process[..., a] * far for a in range(3))
-    q = np.zeros_like(cov)
-    q[..., 0, 0] = c * c * along + s * s * across
-    q[..., 1, 1] = s * s * along + c * c * across
-    q[..., 0, 1] = q[..., 1, 0] = c * s * (along - across)
-    q[..., 2, 2] = yaw
-    return new, f @ cov @ np.swapaxes(f, -1, -2) + q
+def _rotated(angle: Array, v: Array) -> Array:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1]])
 
 
-def aligned_headings(
-    pose: Float[np.ndarray, "run pose 3"], motion: Float[np.ndarray, "run gap 3"]
-) -> Float[np.ndarray, " run"]:
-    """Return the body's heading at the start of every run that aligns its path with its positions.
+def _travel(step: Array) -> Array:
+    """Return the direction of travel in the frame of the pose before; ahead for turns on the spot.
 
-    Paths are aligned by rotation and translation (Procrustes). Where a run has fewer than two
-    positions the result is zero.
+    It counts as known, without a derivative.
     """
-    yaw = np.concatenate([np.zeros((len(pose), 1)), np.cumsum(motion[..., 2], axis=1)], axis=1)
-    step = (motion[..., 0] + 1j * motion[..., 1]) * np.exp(1j * yaw[:, :-1])
-    path = np.concatenate([np.zeros((len(pose), 1)), np.cumsum(step, axis=1)], axis=1)
-    seen = np.isfinite(pose[..., :2]).all(axis=-1)
-    place = np.where(seen, pose[..., 0] + 1j * pose[..., 1], 0.0)
-    number = np.maximum(seen.sum(axis=1), 1)[:, None]
-    path = np.where(seen, path - (path * seen).sum(axis=1, keepdims=True) / number, 0.0)
-    place = np.where(seen, place - place.sum(axis=1, keepdims=True) / number, 0.0)
-    return np.asarray(np.angle((place * path.conj()).sum(axis=1)))
+    step = jax.lax.stop_gradient(step)
+    length = jnp.sqrt(step[0] ** 2 + step[1] ** 2)
+    still = length < 1e-9
+    return jnp.where(still, jnp.array([1.0, 0.0]), step[:2] / jnp.where(still, 1.0, length))
+
+
+def _advanced(state: Array, step: Array, far: Array) -> Array:
+    """Return the state after a predicted motion and the run's effect on it."""
+    x, y = _travel(step)
+    along, across, yaw = far * state[3:]
+    effect = jnp.stack([x * along - y * across, y * along + x * across])
+    place = state[:2] + _rotated(state[2], step[:2] + effect)
+    return jnp.concatenate([place, (state[2] + step[2] + yaw)[None], state[3:]])
+
+
+def _slope(at: Array, step: Array, far: Array, process: Array) -> tuple[Array, Array]:
+    """Return the derivative of `_advanced` with respect to the state, and the process noise."""
+    x, y = far * _rotated(at[2], _travel(step))
+    dx, dy = _advanced(at, step, far)[:2] - at[:2]
+    rows = [
+        [1.0, 0.0, -dy, x, -y, 0.0],
+        [0.0, 1.0, dx, y, x, 0.0],
+        [0.0, 0.0, 1.0, 0.0, 0.0, far],
+    ]
+    slope = jnp.concatenate([jnp.array(rows), jnp.eye(6)[3:]])
+    along, across, yaw = process / jnp.maximum(far, 1e-12)
+    square = [
+        [x * x * along + y * y * across, x * y * (along - across), 0.0],
+        [x * y * (along - across), y * y * along + x * x * across, 0.0],
+        [0.0, 0.0, yaw * far**2],
+    ]
+    return slope, jnp.pad(jnp.array(square), (0, 3))
+
+
+Tracks = tuple[np.ndarray, ...]
+"""Poses, turns, their slopes, distances and start headings of all tracks."""
+
+
+@jax.jit
+def innovations(
+    numbers: Motion, reference: Motion, log_noise: Array | np.ndarray, tracks: Tracks
+) -> Innovations:
+    """Return the innovations of all tracks, with filter gains along the path of `reference`.
+
+    `log_noise` (track, 8) are the logarithms of the variances of positions [m^2] and headings
+    [rad^2], of process noise along, across and in yaw per distance, and of a run's effects along,
+    across and in yaw per distance.
+    """
+    return jax.vmap(_innovations)(numbers, reference, log_noise, tracks)
+
+
+@jax.jit
+def linear_innovations(
+    numbers: Motion, log_noise: Array | np.ndarray, tracks: Tracks
+) -> tuple[Float[Array, "track gap 3"], Motion]:
+    """Return the whitened innovations of all tracks and their derivative with respect to `numbers`.
+
+    The derivative has the form of `numbers`, with leading axes (track, gap, 3).
+    """
+
+    def one(numbers: Motion, log_noise: Array, track: tuple[Array, ...]) -> tuple[Array, Motion]:
+        def white(n: Motion) -> tuple[Array, Array]:
+            return (_innovations(n, numbers, log_noise, track).white,) * 2
+
+        slope, value = jax.jacfwd(white, has_aux=True)(numbers)
+        return value, slope
+
+    return jax.vmap(one)(numbers, log_noise, tracks)
+
+
+@jax.jit
+def loss_of_noise(
+    numbers: Motion, log_noise: Array | np.ndarray, tracks: Tracks
+) -> tuple[Float[Array, " track"], Float[Array, "track 8"]]:
+    """Return minus twice the log likelihood of every track, and its derivative.
+
+    The derivative is with respect to `log_noise`.
+    """
+
+    def one(log_noise: Array, numbers: Motion, track: tuple[Array, ...]) -> tuple[Array, Array]:
+        def loss(v: Array) -> tuple[Array, Array]:
+            at = _innovations(numbers, numbers, v, track)
+            return ((at.white**2).sum() + at.log_variance,) * 2
+
+        slope, value = jax.jacfwd(loss, has_aux=True)(log_noise)
+        return value, slope
+
+    return jax.vmap(one)(log_noise, numbers, tracks)
+
+
+@jax.jit
+def start_headings(
+    matrix: Float[Array, "track 3 drive"],
+    pose: Float[Array, "track pose 3"],
+    turn: Float[Array, "track gap step drive"],
+) -> Float[Array, " track"]:
+    """Return the body's heading at the start of every track that aligns its path with its poses.
+
+    Predicted and measured positions are aligned by a rotation and a translation (Procrustes). With
+    fewer than two positions, the result is zero.
+    """
+
+    def one(matrix: Array, pose: Array, turn: Array) -> Array:
+        motion = moved(matrix, turn)
+        yaw = jnp.concatenate([jnp.zeros(1), jnp.cumsum(motion[:, 2])])
+        step = (motion[:, 0] + 1j * motion[:, 1]) * jnp.exp(1j * yaw[:-1])
+        path = jnp.concatenate([jnp.zeros(1), jnp.cumsum(step)])
+        seen = jnp.isfinite(pose[:, :2]).all(axis=1)
+        place = jnp.where(seen, pose[:, 0] + 1j * pose[:, 1], 0.0)
+        count = jnp.maximum(seen.sum(), 1)
+        path = jnp.where(seen, path - (path * seen).sum() / count, 0.0)
+        place = jnp.where(seen, place - place.sum() / count, 0.0)
+        return jnp.angle((place * path.conj()).sum())
+
+    return jax.vmap(one)(matrix, pose, turn)
+
+
+@jax.jit
+def sensor_yaw(
+    matrix: Float[Array, "track 3 drive"],
+    pose: Float[Array, "track pose 3"],
+    turn: Float[Array, "track gap step drive"],
+) -> Float[Array, ""]:
+    """Return the heading of the pose sensor less that of the body, from directions of travel."""
+    motion = jax.vmap(moved)(matrix, turn)
+    seen = jnp.diff(pose[..., 0] + 1j * pose[..., 1], axis=1) * jnp.exp(-1j * pose[:, :-1, 2])
+    return -jnp.angle(jnp.nansum(seen * (motion[..., 0] - 1j * motion[..., 1])))
