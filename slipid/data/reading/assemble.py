@@ -135,9 +135,7 @@ def _angle(
     for values in signal.values.T:
         there = ~np.isnan(values)
         time, values = signal.time[there], values[there]
-        if name == "wheel_ticks":
-            values = _ticks(values, layout, notes)
-        elif name.endswith("speed"):
+        if name.endswith("speed"):
             read = readings(time, values)
             slow += not read.all()
             time, values = time[read], values[read]
@@ -158,25 +156,6 @@ def per_wheel(name: str, layout: SensorLayout) -> float:
     if name == "wheel_ticks":
         return 2.0 * np.pi / (float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio)
     return 1.0 / layout.gear_ratio if name.startswith("motor") else 1.0
-
-
-def _ticks(
-    ticks: Float[np.ndarray, " sample"], layout: SensorLayout, notes: list[str]
-) -> Float[np.ndarray, " sample"]:
-    """Return the cumulative ticks of one wheel.
-
-    Increments are summed; the wrap-around of a counter of `tick_bits` bits is removed, with a note.
-    """
-    if layout.ticks_are_increments:
-        return np.cumsum(ticks)
-    period = 2.0**layout.tick_bits
-    steps = np.diff(ticks)
-    if np.abs(steps).max(initial=0.0) <= 0.5 * period:
-        return ticks
-    note = f"the wrap-around of the tick counter at {layout.tick_bits} bits was removed"
-    if note not in notes:
-        notes.append(note)
-    return ticks - period * np.concatenate([[0.0], np.cumsum(np.round(steps / period))])
 
 
 def _of_wheels(signals: Mapping[str, Signal], layout: SensorLayout) -> dict[str, Signal]:

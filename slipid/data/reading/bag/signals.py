@@ -15,7 +15,7 @@ from slipid.data.reading.bag.plan import ChannelPlan
 from slipid.data.reading.bag.streams import Edge, JointPick, Stream, TransformPick
 from slipid.data.reading.bag.transforms import STATIC, TransformSeries, composed, heading, tilt
 from slipid.data.reading.layout import CHANNELS, GROUPS, PER_WHEEL
-from slipid.data.reading.signal import Signal, SignalSource, first_true
+from slipid.data.reading.signal import Signal, SignalSource, cumulative_ticks, first_true
 from slipid.data.reading.units import factor
 from slipid.support.errors import bad_data, did_you_mean, first_names
 
@@ -217,6 +217,8 @@ def channel_signal(
     else:
         streams = [checked_stream(stream) for stream in streams]
     streams = [cleaned(stream, layout, notes) for stream in streams]
+    if plan.channel == "wheel_ticks":
+        streams = [_counted(stream, layout, notes) for stream in streams]
     if len(streams) == 1 and mostly_whole(streams[0]):
         samples = whole_signal(streams[0], notes)
     else:
@@ -231,6 +233,12 @@ def channel_signal(
         raise samples.source.error(found, "one number; select it by its index, such as [0]")
     values = (samples.values * scale + plan.spec.offset) * factor(plan.unit, CHANNELS[plan.channel])
     return Signal(samples.time, values, samples.source)
+
+
+def _counted(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
+    """Return a stream of tick counters with their cumulative ticks."""
+    counts = np.where(stream.absent, np.nan, stream.values)
+    return replace(stream, values=np.nan_to_num(cumulative_ticks(counts, layout, notes)))
 
 
 def checked_stream(stream: Stream) -> Stream:
