@@ -8,7 +8,6 @@ from functools import cache
 from math import pi, tau
 
 import numpy as np
-
 import pytest
 
 from slipid.data.check.ratios import ScaleRatio, single_causes
