@@ -360,7 +360,9 @@ def _possible(
         found["wheel_gear"] = found["wheel_gear"]._replace(common=of_rates)
     for name, quantity in found.items():
         both = tuple(f for one in quantity.common for f in (one, 1 / one))
-        gear = (gear_ratio, 1 / gear_ratio) if name in _BY_GEAR and gear_ratio > 1.5 else ()
+        gear: tuple[float, ...] = ()
+        if name in _BY_GEAR and gear_ratio > 1.5:
+            gear = (gear_ratio, 1 / gear_ratio)
         if gear and name in _WHEEL_SCALES and reading.channel:
             gear = gear[1:] if isclose(reading.divided_by, gear_ratio) else gear[:1]
         found[name] = quantity._replace(common=(*gear, *both))
