@@ -51,7 +51,7 @@ class FileChannel:
 
 
 Channels = tuple[list[FileChannel], list[str], list[str]]
-"""The channels of a file, the names of its other columns with numbers, and remarks for the user."""
+"""The channels of a file, the names of its other columns, and remarks for the user."""
 
 
 def channels_in(numbers: TableNumbers) -> Channels:
@@ -83,7 +83,7 @@ def channels_in(numbers: TableNumbers) -> Channels:
         notes.append(f"not used, a second column: {', '.join(also)}")
     kept, dropped = _consistent(list(first.values()))
     used = {at for one in kept for at in one.columns}
-    unused = [format.names[at] for at in meanings if at not in used]
+    unused = [name for at, name in enumerate(format.names) if name and at not in used]
     return kept, unused, notes + dropped
 
 

@@ -18,7 +18,14 @@ from slipid.data.reading.bag.topics import read_bag
 from slipid.data.reading.checks import MIN_ROWS, UnusablePose, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
-from slipid.data.reading.signal import Identity, RawRun, Signal, SignalSource, heading
+from slipid.data.reading.signal import (
+    Identity,
+    RawRun,
+    Signal,
+    SignalSource,
+    cumulative_ticks,
+    heading,
+)
 from slipid.data.reading.table import Table, read_table
 from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError, first_names
@@ -256,6 +263,8 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
             notes.append(
                 f"column '{columns[j]}' has empty cells: it is used at the times of its values"
             )
+        if name == "wheel_ticks":
+            cells = cumulative_ticks(cells, layout, notes)
         values = (cells * channel.scale + channel.offset) * layout.to_si(name)
         signal, there = Signal(time, values, source), ~missing.all(axis=1)
         out[name] = signal if there.all() else signal.part(there)
