@@ -315,7 +315,9 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
 def check_dates(path: Path, line: str, header: list[str], layout: Layout) -> None:
     """Raise `DataError` if a time in the first row is a date, and its declared unit is not s."""
     cells, time = cells_of(line, layout.delimiter), layout.channels.get("time")
-    for column in () if time is None or same_unit(time.unit, "s") else time.columns:
+    if time is None or same_unit(time.unit, "s"):
+        return
+    for column in time.columns:
         at = header.index(str(column))
         if at < len(cells) and _seconds_since_1970(cells[at]) is not None:
             found = f"the date '{cells[at]}' in a column with the unit '{time.unit}'"
