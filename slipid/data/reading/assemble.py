@@ -13,13 +13,15 @@ from jaxtyping import Bool, Float
 
 from slipid.data.align.clock import Clock, best_clock
 from slipid.data.align.regression import MotionPair
-from slipid.data.log import Log
+from slipid.data.log import Log, WheelReading
 from slipid.data.reading.checks import UnusablePose
 from slipid.data.reading.layout import GROUPS, TURNS, SensorLayout
 from slipid.data.reading.signal import RawRun, Signal, clock_of, first_true
 from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
 
+_FEWEST_TICKS = 20
+"""Least number of different whole numbers for which angles may be ticks."""
 EPOCH = 1e6
 """Times above this are counted from 1970, not from the start of the robot [s]."""
 
@@ -55,6 +57,7 @@ def assembled(run: RawRun, layout: SensorLayout) -> Log:
         **vars(run.identity),
         time=clock - start,
         wheel_angle=angle,
+        wheel_reading=_reading(turns, signals, layout),
         wheel_speed=held.get("wheel_speed"),
         wheel_speed_command=held.get("wheel_speed_command"),
         twist_command=_twist(held, len(clock)),
@@ -149,6 +152,16 @@ def _angle(
         )
     angle = np.stack(columns, axis=1) * per_wheel(name, layout)
     return angle - angle[0]
+
+
+def _reading(name: str | None, signals: Mapping[str, Signal], layout: SensorLayout) -> WheelReading:
+    """Return what the angles of the wheels are computed from: the channel `name`."""
+    if name is None:
+        return WheelReading()
+    values = signals[name].values[~np.isnan(signals[name].values)]
+    whole = name.endswith("angle") and bool((values == np.round(values)).all())
+    whole = whole and len(np.unique(values)) >= _FEWEST_TICKS
+    return WheelReading(name, layout.gear_ratio, whole)
 
 
 def per_wheel(name: str, layout: SensorLayout) -> float:

@@ -153,10 +153,12 @@ def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) 
     source = SignalSource(first.source.path, names, lines, topics)
     if not len(time):
         raise source.error("its columns share no time", "columns that were recorded together")
+    # The columns of plain numbers are all called `data`: then the names of the topics differ.
+    called = names if len(set(names)) > 1 else tuple(stream.topic.name for stream, _ in pairs)
     gap = max(float(np.diff(one.time).max(initial=0.0)) for one in signals)
     notes.append(
-        f"topics {topics}: {', '.join(names[1:])} were sampled at other times than {names[0]} and "
-        f"were interpolated to its times (longest gap {gap:.3g} s)"
+        f"topics {topics}: {', '.join(called[1:])} were sampled at other times than {called[0]} "
+        f"and were interpolated to its times (longest gap {gap:.3g} s)"
     )
     columns = zip(signals, pairs, strict=True)
     values = [np.interp(time, one.time, one.values[:, j]) for one, (_, j) in columns]

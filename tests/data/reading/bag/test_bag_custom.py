@@ -120,6 +120,7 @@ def test_counters_of_several_topics_are_continued_before_they_are_joined(tmp_pat
     right = np.interp(TIME[1:], TIME + 0.004, -counts[1])
     np.testing.assert_allclose(ticks[:, 1], right, atol=0.01)
     assert "the wrap-around of the tick counter at 16 bits was removed" in run.notes
+    assert any("/right were sampled at other times than /left" in note for note in run.notes)
 
 
 def test_a_pose_inside_a_message_of_ones_own(tmp_path):
