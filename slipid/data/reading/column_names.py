@@ -1,6 +1,7 @@
 """Dictionary of words in column and topic names, from which the channel and unit are guessed."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
@@ -107,6 +108,32 @@ class ColumnMeaning:
     doubt: str = ""
 
 
+def stamp_columns(names: Sequence[str]) -> tuple[int, int] | None:
+    """Return the positions of two columns that together are a time, or None if there are none.
+
+    They have the seconds and the nanoseconds of a stamp, such as `stamp.sec` and `stamp.nanosec`.
+    """
+    at = {name.lower(): k for k, name in enumerate(names)}
+    for name, seconds in at.items():
+        if (found := re.fullmatch(r"(|.*[^a-z])s(|ec|ecs|econds)", name)) is None:
+            continue
+        roles = {(role, value) for role, value, _ in name_parts(found[1]).roles}
+        if not roles <= {("what", "time"), ("noise", "")} or name_parts(found[1]).unknown:
+            continue
+        for part in ("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"):
+            if found[1] + part in at:
+                return seconds, at[found[1] + part]
+    return None
+
+
+def _without_prefix(name: str) -> str:
+    """Return a name such as `/vrpn/robot/pose/x` without the first parts that mean nothing."""
+    parts = name.strip("/").split("/")
+    while len(parts) > 1 and all(role == "noise" for role, _, _ in name_parts(parts[0]).roles):
+        parts = parts[1:]
+    return "/".join(parts)
+
+
 def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMeaning:
     """Return the meaning of a column or of a topic's field by its name.
 
@@ -122,6 +149,8 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
     # An ending such as v may be a word (speed) instead of a unit: the whole name is tried first.
     if name[len(bare) :].lower()[1:] in _SHORT:
         texts.reverse()
+    if "/" in bare and (inside := _without_prefix(bare)) != bare:
+        texts.append(inside)
     tried = [(name_parts(text), strict) for strict in (True, False) for text in texts]
     for parts, strict in tried:
         if strict and (parts.unknown or parts.mended):

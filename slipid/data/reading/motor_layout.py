@@ -4,7 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from slipid.data.reading.column_names import ColumnMeaning, meaning_of, unit_in, without_unit
+from slipid.data.reading.column_names import (
+    ColumnMeaning,
+    meaning_of,
+    stamp_columns,
+    unit_in,
+    without_unit,
+)
 from slipid.data.reading.layout import CHANNELS, Channel, Layout
 from slipid.data.reading.table_format import TableFormat
 from slipid.data.reading.units import converts
@@ -67,6 +73,9 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
                 found = f"no column '{name}'{did_you_mean(name, names)}"
                 raise bad_data(format.path, found, f"one of {', '.join(names)}")
         channels[channel] = _channel(channel, one.columns, format, one.unit)
+    stamp = stamp_columns(format.names)
+    if stamp and "time" not in channels:
+        channels["time"] = Channel(tuple(format.names[at] for at in stamp), "s")
     taken = {column for one in channels.values() for column in one.columns}
     for channel in _CHANNELS:
         more = channel in ("duty", "bus_voltage") and "voltage" in channels
