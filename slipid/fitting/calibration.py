@@ -2,7 +2,8 @@
 
 Every fit begins with these numbers (see `slipid.model.kinematics` for the equations):
 
-    radius of drive j on floor k     r_kj = r exp(c + d_j + rho_k),   rho = 0 on the firmest floor
+    radius of drive j on floor k     r_kj = r exp(c + d_j + rho_k + e_kj),   rho = 0 on the firmest
+                                     floor; e = 0 if there is only one floor
     track or base on floor k         b_k = b exp(f_k)
     centre of rotation on floor k    x_k, for more than two wheels that point ahead; 0 on the
                                      firmest floor, since only its distance from the sensor shows
@@ -49,9 +50,10 @@ from slipid.support.content import Content
 Verdict = Literal["identified", "weak", "not_identified", "fixed"]
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior) for the verdicts `identified` and `weak`."""
-RADIUS_STD, DRIVE_STD, FLOOR_STD, BASE_STD = 0.3, 0.05, 0.3, 0.5
+RADIUS_STD, DRIVE_STD, FLOOR_STD, DRIVE_ON_FLOOR_STD, BASE_STD = 0.3, 0.05, 0.3, 0.03, 0.5
 """Prior stds of the logarithms of the radius, of the drives' deviations from it, of a floor's
-radius over that of the firmest floor, and of the track or base over the config's [1]."""
+radius over that of the firmest floor, of the drives' further deviations on a floor, and of the
+track or base over the config's [1]."""
 LAG_STD, YAW_STD, SESSION_STD = 0.3, 0.5, 0.02
 """Prior stds of the lag [s], of the sensor's yaw and of its deviation in a session [rad]."""
 LOOSE_SCALE_STD = 0.01
@@ -201,6 +203,11 @@ class Calibration:
         }
 
 
+def _radius_names(floor: str, drive: int) -> tuple[str, ...]:
+    """Return the names of the coordinates whose sum is log r_kj / r."""
+    return "radius", f"drive.{drive}", f"floor.{floor}", f"drive.{drive}@{floor}"
+
+
 @dataclass(frozen=True)
 class _Number:
     """Gaussian prior of one coordinate of the search vector; a std of 0 fixes it."""
@@ -240,6 +247,9 @@ class _Model:
         numbers |= {f"drive.{j}": _Number(0.0, DRIVE_STD) for j in range(shape.drives)}
         others = [f for k, f in enumerate(floors) if k != firmest]
         numbers |= {f"floor.{f}": _Number(0.0, FLOOR_STD) for f in others}
+        if others:
+            own = {f"drive.{j}@{f}" for f in floors for j in range(shape.drives)}
+            numbers |= {name: _Number(0.0, DRIVE_ON_FLOOR_STD) for name in sorted(own)}
         numbers |= {f"base.{f}": _Number(0.0, BASE_STD) for f in floors}
         if not shape.determines_twist and not is_axle(shape):
             numbers |= {f"centre.{f}": _Number(0.0, size) for f in others}
@@ -253,7 +263,10 @@ class _Model:
         numbers["lag"] = _given(space, choices, "camera.lag", LAG_STD)
         numbers["scale"] = scale
         straight = set(floors) - _floors_with_turns(space, data)
-        unseen = {f"{what}.{f}" for f in straight for what in ("base", "centre")} & set(numbers)
+        unseen = {f"{what}.{f}" for f in straight for what in ("base", "centre")}
+        if straight == set(floors):
+            unseen |= {"offset.x", "offset.y"}
+        unseen &= set(numbers)
         return cls(space, floors, sessions, firmest, numbers, frozenset(unseen))
 
     @cached_property
@@ -278,22 +291,23 @@ class _Model:
     def kinematics(self, z: Float[np.ndarray, "*batch free"]) -> Kinematics:
         """Return the kinematics at a search vector; for several, arrays have leading axes."""
         shape, floors = self.space.template.geometry, self.floors
-        radius = [
-            [self.column(f"drive.{j}", z) + self.column(f"floor.{f}", z) for j in range(shape.drives)]
-            for f in floors
-        ]
-        common = self.column("radius", z)[..., None, None]
+        drives = range(shape.drives)
+        radius = np.array(
+            [[sum(self.column(n, z) for n in _radius_names(f, j)) for j in drives] for f in floors]
+        )
         base = np.stack([self.column(f"base.{f}", z) for f in floors], axis=-1)
         return Kinematics(
             floors,
             self.rolling,
             self.nominal_base,
-            float(shape.wheel_radius) * np.exp(common + np.moveaxis(np.array(radius), (0, 1), (-2, -1))),
+            float(shape.wheel_radius) * np.exp(np.moveaxis(radius, (0, 1), (-2, -1))),
             self.nominal_base * np.exp(base),
             np.stack([self.column(f"centre.{f}", z) for f in floors], axis=-1),
         )
 
-    def matrices(self, z: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch floor 3 drive"]:
+    def matrices(
+        self, z: Float[np.ndarray, "*batch free"]
+    ) -> Float[np.ndarray, "*batch floor 3 drive"]:
         """Return the matrices from wheel turns to body increments on every floor."""
         return self.kinematics(z).matrices()
 
@@ -536,15 +550,18 @@ def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calib
         fit = _referred(fit, choices, int(np.argmax(radius)))
         if abs(float(fit.model.column("lag", fit.z)) - fit.tracks.lag) > RECUT_S:
             fit = _cut(fit)
-        elif fit.model.firmest == before.model.firmest:
-            if _in_stds(fit.z - before.z, fit.gradient[1]) < SETTLED:
-                break
-    global LAST
-    LAST = fit
+        elif (
+            fit.model.firmest == before.model.firmest
+            and _in_stds(fit.z - before.z, fit.gradient[1]) < SETTLED
+        ):
+            break
+
     return _result(fit, len(data))
 
 
-def _in_stds(change: Float[np.ndarray, " free"], precision: Float[np.ndarray, "free free"]) -> float:
+def _in_stds(
+    change: Float[np.ndarray, " free"], precision: Float[np.ndarray, "free free"]
+) -> float:
     """Return the largest change of a coordinate, in its standard deviations."""
     return float((np.abs(change) / np.sqrt(np.diag(np.linalg.inv(precision)))).max())
 
@@ -617,7 +634,11 @@ def _result(fit: _Fit, runs: int) -> Calibration:
     def value(names: Sequence[str], unit: str, log_of: float | None = None) -> Value:
         """Return the sum of some coordinates, or the exponential of the sum, times `log_of`."""
         w = np.array([float(name in names) for name in model.free])
-        prior = float(np.hypot.reduce([model.numbers[name].std for name in names if name in model.numbers], initial=0.0))
+        prior = float(
+            np.hypot.reduce(
+                [model.numbers[name].std for name in names if name in model.numbers], initial=0.0
+            )
+        )
         at = sum(float(model.column(name, z)) for name in names)
         influence = (off @ w) ** 2
         jackknife = (count - 1) / count * float(influence.sum())
@@ -641,16 +662,11 @@ def _result(fit: _Fit, runs: int) -> Calibration:
         kinematics=model.kinematics(z),
         sideways=shape.determines_twist,
         radius={
-            f: tuple(
-                value(["radius", f"drive.{j}", f"floor.{f}"], "m", radius)
-                for j in range(shape.drives)
-            )
+            f: tuple(value(_radius_names(f, j), "m", radius) for j in range(shape.drives))
             for f in model.floors
         },
         base={f: value([f"base.{f}"], "m", base) for f in model.floors},
-        centre={
-            f: value([f"centre.{f}"], "m") for f in model.floors if model.has_centre
-        },
+        centre={f: value([f"centre.{f}"], "m") for f in model.floors if model.has_centre},
         offset=(value(["offset.x"], "m"), value(["offset.y"], "m")),
         yaw=value(["yaw"], "rad"),
         session_yaw={s: float(model.column(f"yaw@{s}", z)) for s in model.sessions},

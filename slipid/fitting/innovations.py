@@ -16,13 +16,12 @@ at the ends of a run. The start of every run is free.
 Source: innovations form of the likelihood, Schweppe 1965, IEEE Transactions on Information Theory.
 """
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
@@ -194,7 +193,7 @@ def moved(
 
 
 def _innovations(
-    numbers: Motion, reference: Motion, log_noise: Array, track: tuple[Array, ...]
+    numbers: Motion, reference: Motion, log_noise: Any, track: tuple[Any, ...]
 ) -> Innovations:
     """Return the innovations of one track; the filter's gains are those along `reference`.
 
@@ -221,9 +220,7 @@ def _innovations(
     at, offset = start(reference)
     lever = jnp.stack([offset[1], -offset[0], jnp.ones(()), *jnp.zeros((3,))])
     turn_var = jnp.where(known[0, 2], noise[1], UNKNOWN_HEADING_STD**2)
-    place_var = jnp.where(
-        known[0, :2].all(), reference.scale**2 * noise[0], UNKNOWN_PLACE_STD**2
-    )
+    place_var = jnp.where(known[0, :2].all(), reference.scale**2 * noise[0], UNKNOWN_PLACE_STD**2)
     cov = turn_var * jnp.outer(lever, lever) + jnp.diag(
         jnp.concatenate([place_var[None], place_var[None], jnp.zeros(1), noise[5:8]])
     )
@@ -242,7 +239,7 @@ def _innovations(
         ox, oy = _rotated(at[2], reference.place)
         s = 1 / reference.scale
         h = jnp.array([[s, 0, -oy * s, 0, 0, 0], [0, s, ox * s, 0, 0, 0], [0, 0, 1, 0, 0, 0]])
-        change, change_at, white, log = jnp.zeros(6), jnp.zeros(6), [], 0.0
+        change, change_at, white, log = jnp.zeros(6), jnp.zeros(6), [], jnp.zeros(())
         for axis in range(3):
             seen, ph = known[axis], cov @ h[axis]
             variance = jnp.where(seen, h[axis] @ ph + measured[axis], 1.0)
@@ -331,14 +328,14 @@ def linear_innovations(
     The derivative has the form of `numbers`, with leading axes (track, gap, 3).
     """
 
-    def one(numbers: Motion, log_noise: Array, track: tuple[Array, ...]) -> tuple[Array, Motion]:
+    def one(numbers: Motion, log_noise: Array, track: Tracks) -> tuple[Array, Motion]:
         def white(n: Motion) -> tuple[Array, Array]:
             return (_innovations(n, numbers, log_noise, track).white,) * 2
 
         slope, value = jax.jacfwd(white, has_aux=True)(numbers)
         return value, slope
 
-    return jax.vmap(one)(numbers, log_noise, tracks)
+    return jax.vmap(one)(numbers, jnp.asarray(log_noise), tracks)
 
 
 @jax.jit
@@ -350,7 +347,7 @@ def loss_of_noise(
     The derivative is with respect to `log_noise`.
     """
 
-    def one(log_noise: Array, numbers: Motion, track: tuple[Array, ...]) -> tuple[Array, Array]:
+    def one(log_noise: Array, numbers: Motion, track: Tracks) -> tuple[Array, Array]:
         def loss(v: Array) -> tuple[Array, Array]:
             at = _innovations(numbers, numbers, v, track)
             return ((at.white**2).sum() + at.log_variance,) * 2
@@ -358,7 +355,7 @@ def loss_of_noise(
         slope, value = jax.jacfwd(loss, has_aux=True)(log_noise)
         return value, slope
 
-    return jax.vmap(one)(log_noise, numbers, tracks)
+    return jax.vmap(one)(jnp.asarray(log_noise), numbers, tracks)
 
 
 @jax.jit
