@@ -87,5 +87,5 @@ def covered(robot: MadeRobot, calibration: dict) -> dict[str, bool]:
     for name, number in numbers(robot).items():
         if stated.get(name, {}).get("interval90") is not None:
             low, high = stated[name]["interval90"]
-            found[name] = low <= number(truth) <= high
+            found[name] = bool(low <= number(truth) <= high)
     return found
