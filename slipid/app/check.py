@@ -13,8 +13,7 @@ from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
 from slipid.data.check.findings import Finding, worst_first
 from slipid.data.check.sanity import findings
-from slipid.data.log import Log
-from slipid.data.runs import Runs
+from slipid.data.runs import Runs, channels
 from slipid.fitting.problem import CREEPS, Problem
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
@@ -100,13 +99,6 @@ def _different_gears(task: ConfigFitTask) -> Iterator[Finding]:
             )
 
 
-_CHANNELS = (
-    *("wheel_speed", "wheel_speed_command", "twist_command", "current", "voltage"),
-    *("duty", "bus_voltage", "gyro", "pose"),
-)
-"""Channels that check.json lists if they are logged, in this order."""
-
-
 @dataclass(frozen=True)
 class ExpectedEstimates:
     """Estimates that a fit is expected to have, before it is made.
@@ -186,7 +178,7 @@ def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
             }
             for (surface, load, session), runs in sorted(groups.items())
         ],
-        "channels": _channels(data.logs),
+        "channels": channels(data.logs),
         "clocks": {log.name: _clock(log.pose_clock) for log in data.logs if log.pose_clock},
         "notes": dict(notes.most_common()),
         "skipped": list(skipped),
@@ -203,17 +195,6 @@ def _clock(clock: Clock) -> Content:
         "drift_std": clock.drift_std,
         "told_by": clock.source,
     }
-
-
-def _channels(logs: tuple[Log, ...]) -> list[str]:
-    """Return the names of the logged channels, with remarks such as "(3 of 5 runs)"."""
-    names = []
-    for name in _CHANNELS:
-        if count := sum(getattr(log, name) is not None for log in logs):
-            part = "" if count == len(logs) else f" ({count} of {len(logs)} runs)"
-            unsigned = name == "current" and not all(log.current_is_signed for log in logs)
-            names.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
-    return names
 
 
 def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
