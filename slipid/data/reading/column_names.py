@@ -56,8 +56,8 @@ _TABLE: dict[str, str] = {
     "noise": (
         "data field fields msg value values actual measured meas feedback fb state states link "
         "robot base body global world map camera cam mocap vicon optitrack tag marker tracker "
-        "lidar slam imu header twist cycle today coordinate coordinates coord axis of the from to in at along "
-        "log sensor drive shaft nsec sec secs ros"
+        "lidar slam imu header twist coordinate coordinates coord axis of the from to in at along "
+        "log sensor drive shaft nsec sec secs ros cycle today"
     ),
 }
 """Words in column names, by role and value: the key `side l` is the role `side` with value `l`."""
