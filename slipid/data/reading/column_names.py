@@ -303,7 +303,7 @@ def _apart(word: str) -> list[str]:
 
 
 def is_electrical(name: str) -> bool:
-    """Return whether a column has the speed of a motor's field: the shaft's times its pole pairs."""
+    """Return whether a column has the speed of a motor's field: the shaft's times pole pairs."""
     return "erpm" in name_parts(name).words("rpm")
 
 
