@@ -161,8 +161,8 @@ def _expected(numbers: Mapping[str, Content], title: str | None = None) -> Table
         if e["ratio"] is not None and "session_yaw" not in path:
             # The ratio of an electric parameter may exceed 1, since the uncertainty of the motion
             # is added to that of its prior.
-            ends = (("ratio", "verdict"), ("best_ratio", "best_verdict"))
-            ends = [(min(e[ratio], 1.0), e[word]) for ratio, word in ends if ratio in e]
+            keys = (("ratio", "verdict"), ("best_ratio", "best_verdict"))
+            ends = [(min(e[ratio], 1.0), e[word]) for ratio, word in keys if ratio in e]
             ratios = dict.fromkeys(f"{ratio:.3f}" for ratio, _ in ends)
             words = dict.fromkeys(verdict(word) for _, word in ends)
             made.add_row(Text(path), e["unit"], " .. ".join(ratios), " to ".join(words))
