@@ -227,7 +227,7 @@ def unit_of(one: FileStudy, found: FileChannel, run: RunStudy, robot: RobotAnswe
     if channel == "current":
         return current_unit(most)
     if channel == "duty":
-        return duty_unit(most)
+        return duty_unit(found.values)
     if channel.startswith("twist_command") and channel != "twist_command_yaw":
         return UnitGuess("m/s") if most < 20 else UnitGuess("mm/s", f"up to {most:.4g}")
     if channel in ("twist_command_yaw", "gyro"):

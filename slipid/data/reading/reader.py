@@ -230,7 +230,7 @@ def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
 def _run_starts(table: Table, layout: Layout) -> list[int]:
     """Return the first row of every run."""
     if layout.new_run == "time_restarts":
-        time = table.stacked(layout.channels["time"])[:, 0]
+        time = _time(table, layout)
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
         # In files with this layout the robot only drives away from the start of each run, so the
@@ -279,4 +279,6 @@ def _time(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
         return np.arange(len(table.values)) * float(layout.row_period or 1.0)
     channel = layout.channels["time"]
     cells = table.stacked(channel)
+    if cells.shape[1] == 2:
+        cells = cells[:, :1] + 1e-9 * cells[:, 1:]
     return ((cells * channel.scale + channel.offset) * layout.to_si("time"))[:, 0]
