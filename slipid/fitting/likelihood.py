@@ -226,7 +226,7 @@ def marker_increments(
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
     """Return the predicted motor current of every window [A]; its magnitude for unsigned logs.
 
-    It is the mean over the window: wheels at rest have no friction, and a robot at rest no traction.
+    It is the mean over the window, in which wheels at rest have no friction and no traction.
     """
     # `motor_force` is in units of mu m g with mu averaged over the wheels; `weight` is that unit.
     friction = robot.surfaces.friction[b.surface]
