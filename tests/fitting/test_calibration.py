@@ -62,7 +62,8 @@ def test_own_differential_drive(task_of):
     for floor, radius in (("carpet", 0.0757), ("tile", 0.0770)):
         assert all(near(r, radius, 1e-3 * radius) for r in found.radius[floor])
         assert near(found.base[floor], 0.448, 1e-3)
-    assert near(found.offset[0], 0.060, 1e-3) and near(found.offset[1], 0.010, 1e-3)
+    assert near(found.offset[0], 0.060, 1e-3)
+    assert near(found.offset[1], 0.010, 1e-3)
     assert near(found.lag, 0.040, 2e-3)
     assert found.firmest == "tile"
     radius, track = found.multipliers["tile"]
@@ -72,7 +73,8 @@ def test_own_differential_drive(task_of):
 
 def test_skid_steer_has_a_track_and_a_centre_on_each_floor(task_of):
     found = calibrated(task_of(MADE["skid_two_floors"]))
-    assert near(found.base["asphalt"], 0.825, 0.01) and near(found.base["grass"], 0.99, 0.012)
+    assert near(found.base["asphalt"], 0.825, 0.01)
+    assert near(found.base["grass"], 0.99, 0.012)
     assert found.centre["asphalt"].verdict == "fixed"
     assert near(found.centre["grass"], -0.06, 0.01)
 
@@ -102,7 +104,8 @@ def test_positions_without_headings(task_of):
 
 def test_a_number_that_the_config_fixes_stays(task_of):
     found = calibrated(task_of(MADE["diff_own"]), Choice("camera.lag", fixed=0.02))
-    assert found.lag.value == 0.02 and found.lag.verdict == "fixed"
+    assert found.lag.value == 0.02
+    assert found.lag.verdict == "fixed"
     assert found.lag.interval90 == (0.02, 0.02)
 
 
