@@ -144,10 +144,9 @@ def corrected(rolling: Twists, numbers: Float[np.ndarray, " number"]) -> Twists:
     return np.stack([a * s + c * d, f * s - x * yaw, yaw], axis=-1)
 
 
-CALIBRATED_STDS = (0.3, 0.5, 0.3)
-"""Prior stds of log radius and log base ratios [1] and of the centre of rotation [m]."""
-PRIOR_STEP_M = 1e-4
-"""Error of a window's displacement that counts as much as one prior std [m]."""
+CALIBRATED_STDS = (0.3, 0.05, 0.5, 0.3)
+"""Prior stds of log radius ratios, of their deviations from their mean, of log base ratios [1], and
+of the centre of rotation [m]."""
 
 
 @final
@@ -170,20 +169,24 @@ class Calibrated(TwistModel):
         from scipy.optimize import least_squares
 
         drives = w.steps.signals.turn.shape[1]
-        radius, base, centre = CALIBRATED_STDS
-        std = np.array([*[radius] * drives, base, 0.0 if spec.determines_twist else centre])
-        free = np.flatnonzero(std > 0)
+        radius, deviation, *others = CALIBRATED_STDS
+        free = drives + 1 if spec.determines_twist else drives + 2
 
-        def of(z: np.ndarray) -> np.ndarray:
-            full = np.zeros(len(std))
-            full[free] = z
-            return full
+        def model(z: np.ndarray) -> "Calibrated":
+            return replace(self, coefficients=np.pad(z, (0, drives + 2 - free)))
 
-        def errors(z: np.ndarray) -> np.ndarray:
-            found = w.errors(replace(self, coefficients=of(z)).twist(w.steps, spec), spec)
-            return np.concatenate([found, PRIOR_STEP_M * z / std[free]])
+        def errors(z: np.ndarray, noise: float) -> np.ndarray:
+            """Return errors of displacements [m], and of the prior in units of their noise."""
+            own, rest = z[:drives], z[drives:]
+            prior = [own / radius, (own - own.mean()) / deviation, rest / others[: len(rest)]]
+            found = w.errors(model(z).twist(w.steps, spec), spec)
+            return np.concatenate([found, noise * np.concatenate(prior)])
 
-        return replace(self, coefficients=of(least_squares(errors, np.zeros(len(free))).x))
+        z, noise = np.zeros(free), 1e-4
+        for _ in range(2):  # the second time with the noise that the first one has left
+            z = least_squares(errors, z, args=(noise,)).x
+            noise = float(np.sqrt(np.mean(errors(z, 0.0) ** 2)))
+        return model(z)
 
     def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
         own = spec if self.shape is None else spec.of_shape(self.shape)
