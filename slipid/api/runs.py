@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.api.fit import Numbers, Prior, fit_task_of
-from slipid.app.check import ExpectedEstimates, expected, overview
+from slipid.app.check import ExpectedEstimate, ExpectedEstimates, expected, overview
 from slipid.data.runs import Runs, collect
-from slipid.infer.verdicts.estimates import Estimate
 from slipid.lab.selftest import logs as known
 from slipid.lab.selftest.logs import simulate_logs
 from slipid.model.robot import Robot, steady_states
@@ -36,7 +35,7 @@ class LogCheck:
     def __str__(self) -> str:
         return text_of(show_check, self.content | self.result.to_json())
 
-    def __getitem__(self, path: str) -> Estimate:
+    def __getitem__(self, path: str) -> ExpectedEstimate:
         """Return the expected estimate of one parameter; raise `KeyError` for an unknown path."""
         return self.result.parameters[path]
 

@@ -1,7 +1,7 @@
 """Check of logs and config before a fit, and prediction of how certain each estimate will be."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +13,14 @@ from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
 from slipid.data.check.findings import Finding, worst_first
 from slipid.data.check.sanity import findings
-from slipid.data.log import Log
-from slipid.data.runs import Runs
+from slipid.data.runs import Runs, channels
 from slipid.fitting.problem import CREEPS, Problem
+from slipid.fitting.variances import Search
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.predict.agreement import scatter
+from slipid.search_space import Space
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
@@ -100,11 +101,42 @@ def _different_gears(task: ConfigFitTask) -> Iterator[Finding]:
             )
 
 
-_CHANNELS = (
-    *("wheel_speed", "wheel_speed_command", "twist_command", "current", "voltage"),
-    *("duty", "bus_voltage", "gyro", "pose"),
-)
-"""Channels that check.json lists if they are logged, in this order."""
+@dataclass(frozen=True)
+class ExpectedEstimate:
+    """Range of the estimates of one parameter that a fit may have, before it is made.
+
+    Attributes:
+        least: the least informative estimate.
+        best: the most informative estimate.
+    """
+
+    least: Estimate
+    best: Estimate
+
+    @property
+    def verdict(self) -> str:
+        """Verdict of the least informative estimate."""
+        return self.least.verdict
+
+    def allows(self, verdict: str) -> bool:
+        """Return whether a fit may end with a verdict; any but three depend on the fit alone."""
+        if verdict not in _ORDER:
+            return True
+        ends = (_uncertainty(self.best)[0], _uncertainty(self.least)[0])
+        return ends[0] <= _ORDER.index(verdict) <= ends[1]
+
+    def to_json(self) -> Content:
+        """Return the part of check.json about one parameter."""
+        e, best = self.least, self.best
+        return {
+            "unit": e.unit,
+            "start": e.value,
+            "expected_std": e.std,
+            "ratio": e.ratio,
+            "verdict": e.verdict,
+            "best_ratio": best.ratio,
+            "best_verdict": best.verdict,
+        }
 
 
 @dataclass(frozen=True)
@@ -118,15 +150,15 @@ class ExpectedEstimates:
             measurement that would help.
     """
 
-    parameters: dict[str, Estimate]
-    derived: dict[str, Estimate]
+    parameters: dict[str, ExpectedEstimate]
+    derived: dict[str, ExpectedEstimate]
     messages: tuple[str, ...]
 
     def to_json(self) -> Content:
         """Return the part of check.json with the expected estimates."""
         return {
-            "parameters": {path: _expected_json(e) for path, e in self.parameters.items()},
-            "derived": {path: _expected_json(e) for path, e in self.derived.items()},
+            "parameters": {path: e.to_json() for path, e in self.parameters.items()},
+            "derived": {path: e.to_json() for path, e in self.derived.items()},
             "messages": list(self.messages),
         }
 
@@ -186,7 +218,7 @@ def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
             }
             for (surface, load, session), runs in sorted(groups.items())
         ],
-        "channels": _channels(data.logs),
+        "channels": channels(data.logs),
         "clocks": {log.name: _clock(log.pose_clock) for log in data.logs if log.pose_clock},
         "notes": dict(notes.most_common()),
         "skipped": list(skipped),
@@ -205,64 +237,75 @@ def _clock(clock: Clock) -> Content:
     }
 
 
-def _channels(logs: tuple[Log, ...]) -> list[str]:
-    """Return the names of the logged channels, with remarks such as "(3 of 5 runs)"."""
-    names = []
-    for name in _CHANNELS:
-        if count := sum(getattr(log, name) is not None for log in logs):
-            part = "" if count == len(logs) else f" ({count} of {len(logs)} runs)"
-            unsigned = name == "current" and not all(log.current_is_signed for log in logs)
-            names.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
-    return names
-
-
 def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
-    """Return the expected estimates from the expected information at the start of a fit.
+    """Return the expected estimates from the information that a fit would have.
 
-    The noise variances are estimated from the runs. The parameters of the floors are not known yet;
-    therefore the start values are tried with each creep in `CREEPS`, from which a fit starts. Each
-    parameter gets the least informative of its estimates, and the messages describe the start with
-    the largest determinant of the covariance.
+    This information depends on the parameters and the noise, which are not known before a fit. It
+    is computed as after a fit, at plausible values of the parameters: those from which a fit
+    starts, and draws of the prior. Each is combined with two sizes of the noise: that of the runs'
+    scatter before any physics explains it, and the typical one with which a fit begins.
     """
     space, w = problem.space, problem.windows
-    log_v, keep, volt = scatter(problem), np.ones(len(w)), w.has_voltage
-    creep = space.where(lambda e: e.quantity == "surface.creep")
-    parameters: dict[str, Estimate] = {}
-    ratios: dict[str, Estimate] = {}
+    keep, volt = problem.full_weight, w.has_voltage
+    noises = (scatter(problem), np.log(problem.noise.typical**2))
+    validity = curves_of.validity(task.dataset, space.tree(space.start), problem.batch)
+    where = w.has_current, volt, validity, problem.robot.geometry.determines_twist
+    parameters: dict[str, ExpectedEstimate] = {}
+    ratios: dict[str, ExpectedEstimate] = {}
     open_: tuple[FlatDirection, ...] = ()
     most = -np.inf
-    starts = (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS))
-    covariances = [problem.laplace(z, log_v, keep) for z in starts]
-    # The range of validity is computed after the covariances, since it uses the functions that were
-    # compiled for them.
-    robot = space.tree(space.start)
-    validity = curves_of.validity(task.dataset, robot, problem.batch)
-    where = w.has_current, volt, validity, robot.geometry.determines_twist
-    for covariance in covariances:
-        flat = flat_directions(space, covariance, *where)
-        found = estimates(space, task.choices, space.start, covariance, volt, members(flat))
-        _least(parameters, found)
-        _least(ratios, derived(space, space.start, covariance, volt))
-        uncertainty = float(np.linalg.slogdet(covariance)[1])
-        if uncertainty > most:
-            most, open_ = uncertainty, flat
+    for z in _plausible(space):
+        for covariance in problem.laplaces(z, noises, keep):
+            flat = flat_directions(space, covariance, *where)
+            found = estimates(space, task.choices, z, covariance, volt, members(flat))
+            _widened(parameters, found)
+            _widened(ratios, derived(space, z, covariance, volt))
+            uncertainty = float(np.linalg.slogdet(covariance)[1])
+            if uncertainty > most:
+                most, open_ = uncertainty, flat
+    possible = {path: e.best.verdict for path, e in parameters.items()}
+    open_ = tuple(one for one in open_ if _is_certain(one, possible))
     return ExpectedEstimates(parameters, ratios, sentences(open_))
 
 
-def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
-    """Replace each kept estimate by the found one of the same path if that one is less informative.
+_DRAWS = 3
+"""Number of draws of the prior at which the information is computed, each with its mirror image."""
 
-    An estimate is less informative if its verdict is worse or, at equal verdicts, its ratio larger.
-    """
-    order = ("identified", "weak", "not_identified")
 
-    def promise(e: Estimate) -> tuple[int, float]:
-        return order.index(e.verdict) if e.verdict in order else -1, e.ratio or 0.0
+def _plausible(space: Space) -> Iterator[Search]:
+    """Yield values of the parameters: those from which a fit starts, and draws of their prior."""
+    creep = space.where(lambda e: e.quantity == "surface.creep")
+    for value in CREEPS if creep.any() else CREEPS[:1]:
+        yield np.where(creep, np.log(value), space.start)
+    for step in np.random.default_rng(0).standard_normal((_DRAWS, space.size)):
+        yield space.prior_mean + step * space.prior_std
+        yield space.prior_mean - step * space.prior_std
 
+
+def _widened(kept: dict[str, ExpectedEstimate], found: Iterable[Estimate]) -> None:
+    """Widen the range of expected estimates of each path so that it contains the found one."""
     for e in found:
-        kept[e.path] = max(kept.get(e.path, e), e, key=promise)
+        before = kept.get(e.path, ExpectedEstimate(e, e))
+        least = max(before.least, e, key=_uncertainty)
+        kept[e.path] = ExpectedEstimate(least, min(before.best, e, key=_uncertainty))
 
 
-def _expected_json(e: Estimate) -> Content:
-    kept = {"unit": e.unit, "start": e.value, "expected_std": e.std}
-    return kept | {"ratio": e.ratio, "verdict": e.verdict}
+_ORDER = ("identified", "weak", "not_identified")
+
+
+def _uncertainty(e: Estimate) -> tuple[int, float]:
+    """Return the key that orders estimates by verdict and, at equal verdicts, by their ratio.
+
+    A start at the bound of a parameter, which says nothing about the fit, comes between the
+    verdicts `weak` and `not_identified`.
+    """
+    return (_ORDER.index(e.verdict) if e.verdict in _ORDER else 1), e.ratio or 0.0
+
+
+def _is_certain(one: FlatDirection, possible: Mapping[str, str]) -> bool:
+    """Return True if a direction is flat whatever the parameters are, as far as verdicts show it.
+
+    `possible` is the best expected verdict of each parameter.
+    """
+    allowed = ("not_identified",) if len(one.paths) == 1 else ("not_identified", "weak")
+    return all(possible[path] in allowed for path in one.paths)

@@ -174,13 +174,16 @@ def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Conten
     return content
 
 
-def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Validation]:
+def validate(
+    out: Path, data: Path, report: Reporter, glob: str | None = None
+) -> tuple[Fit, Runs, Validation]:
     """Return a fit, runs to predict, and their predictions by the fit and by all simpler models.
 
     Args:
         out: folder that `slipid identify` wrote.
         data: folder of the logs of the runs.
         report: reporter of the progress.
+        glob: pattern of the paths of the logs, relative to `data`; None for those of the config.
 
     Raises:
         DataError: there is no fit, or the logs cannot be read or predicted.
@@ -188,9 +191,10 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Valida
     setup_jax(quiet=True)
     fit = load(out)
     config = read_config(out / "config.toml")
-    sections = single_floor_sections(config.content.validate_.logs or config.content.logs)
+    logs, others = config.content.logs, config.content.validate_.logs
+    sections = single_floor_sections([*others, *logs] if glob is not None else others or logs)
     report.stage("reading logs")
-    dataset, skipped = read_dataset(config, sections, data, report)
+    dataset, skipped = read_dataset(config, sections, data, report, glob)
     refuse_misordered(dataset.logs)
     for sentence in skipped:
         report.line(sentence)

@@ -19,7 +19,11 @@ from slipid.support.progress import Reporter
 
 
 def read_dataset(
-    config: Config, sections: Sequence[LogsSection], root: Path, report: Reporter
+    config: Config,
+    sections: Sequence[LogsSection],
+    root: Path,
+    report: Reporter,
+    glob: str | None = None,
 ) -> tuple[Runs, list[str]]:
     """Return the runs of some log sections, and a line about each log that was left out.
 
@@ -28,11 +32,15 @@ def read_dataset(
         sections: sections of the config whose logs are read.
         root: data folder.
         report: reporter of the progress.
+        glob: pattern of the paths of the files to read instead of all files of the sections.
 
     Raises:
         DataError: a log cannot be read or is found twice, or there is no run.
     """
-    found, skipped = required_files(config, sections, root)
+    if glob is None:
+        found, skipped = required_files(config, sections, root)
+    else:
+        found, skipped = matching_files(config, sections, root, glob), []
     count = sum(len(paths) for _, paths in found)
     logs: list[Log] = []
     aside: list[str] = []
@@ -84,13 +92,48 @@ def files_of(
     skipped: list[str] = []
     for section in sections:
         try:
-            found.append((section, find_logs(root, section.glob)))
+            found.append((section, _files(root, section.glob, f"{config.path}: logs.glob")))
         except DataError as error:
             skipped.append(f"skipped: {error}")
-        except (ValueError, NotImplementedError) as error:
-            raise DataError(f"{config.path}: logs.glob '{section.glob}': {error}") from error
     own = [(one, without_beside(paths, layout_of(config, one))) for one, paths in found]
     return own, skipped
+
+
+def matching_files(
+    config: Config, sections: Sequence[LogsSection], root: Path, glob: str
+) -> list[tuple[LogsSection, list[Path]]]:
+    """Return the files that match a glob, with the log section by which they are read.
+
+    That is the first section whose own glob matches the file. Other files are read by the first
+    section if all sections have the same layout, floor and load set-up.
+
+    Raises:
+        DataError: no file matches, or the section of a file is not clear.
+    """
+    rest = _files(root, glob, "--logs")
+    out = []
+    for section in sections:
+        mine = set(root.glob(section.glob))
+        out.append((section, [path for path in rest if path in mine]))
+        rest = [path for path in rest if path not in mine]
+    if rest:
+        if len({(one.format, one.surface, one.load) for one in sections}) > 1:
+            raise DataError(
+                f"{rest[0]}: matches '{glob}', but no section of {config.path}, and its sections "
+                "have different layouts, floors or load set-ups; expected files that match one of "
+                + ", ".join(f"'{one.glob}'" for one in sections)
+            )
+        out.append((sections[0], rest))
+    own = [(one, without_beside(paths, layout_of(config, one))) for one, paths in out if paths]
+    return [(one, paths) for one, paths in own if paths]
+
+
+def _files(root: Path, glob: str, where: str) -> list[Path]:
+    """Return the files that match a glob; `where` names the place of the glob in errors."""
+    try:
+        return find_logs(root, glob)
+    except (ValueError, NotImplementedError) as error:
+        raise DataError(f"{where} '{glob}': {error}") from error
 
 
 def layout_of(config: Config, section: LogsSection) -> AnyLayout:

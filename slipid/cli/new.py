@@ -87,6 +87,8 @@ def new(
         draft = propose(log, options)
     for sentence in draft.sentences:
         typer.echo(sentence)
+    for remark in (line for layout in draft.layouts for line in layout.remarks):
+        typer.echo(f"  {remark}")
     config = new_config(draft, out.name)
     write_bytes(out, config.text.encode())
     _show(config, out, draft.data)

@@ -19,17 +19,30 @@ from slipid.support.progress import Reporter
 
 
 @for_robots
-def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet = False) -> int:
+def validate(
+    out: OutFolder,
+    data: DataFolder,
+    logs: Annotated[
+        str | None,
+        option(
+            "GLOB",
+            "Quoted pattern of the paths of the logs in the data folder, such as 'day2/*.csv'. "
+            "Layout, floor and load set-up are those of the config; by default so are the logs.",
+        ),
+    ] = None,
+    json: Json = None,
+    quiet: Quiet = False,
+) -> int:
     """Predict runs open loop with the fit and with simpler models; compare with logged poses."""
     from slipid.report.estimates import show_validation
 
     with Reporter(quiet=quiet) as report:
-        found = run(out, data, report)
+        found = run(out, data, report, logs)
     emit(json, found, lambda page: show_validation(page, found))
     return 0
 
 
-def run(out: Path, data: Path, report: Reporter) -> Content:
+def run(out: Path, data: Path, report: Reporter, logs: str | None = None) -> Content:
     """Return the content of the validation file of runs, and draw their pictures.
 
     Arguments are those of `slipid.app.compare.validate`.
@@ -37,7 +50,7 @@ def run(out: Path, data: Path, report: Reporter) -> Content:
     from slipid.app.compare import validate
     from slipid.plots.fit import validate_plots
 
-    fit, dataset, found = validate(out, data, report)
+    fit, dataset, found = validate(out, data, report, logs)
     report.stage("drawing")
     drawn = validate_plots(fit, dataset, found, out)
     report.line(f"in {out}: {', '.join(path.name for path in drawn)}")

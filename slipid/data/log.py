@@ -9,6 +9,27 @@ from jaxtyping import Bool, Float
 from slipid.data.align.clock import Clock
 
 
+@dataclass(frozen=True)
+class WheelReading:
+    """What the angles of the wheels were computed from, for the advice of checks.
+
+    Attributes:
+        channel: channel of the layout; empty if unknown.
+        gear_ratio: gear ratio of the layout.
+        whole: True if an angle of the layout had whole numbers of radians only, as ticks have.
+    """
+
+    channel: str = ""
+    gear_ratio: float = 1.0
+    whole: bool = False
+
+    @property
+    def divided_by(self) -> float:
+        """Return the gear ratio by which the readings were divided; 1 for those of wheels."""
+        of_motor = self.channel == "wheel_ticks" or self.channel.startswith("motor")
+        return self.gear_ratio if of_motor else 1.0
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Log:
     """One run; all arrays have a row for each time at which at least one sensor was read.
@@ -24,6 +45,7 @@ class Log:
             to start at 0.
         wheel_angle: angle of each wheel [rad], cumulative from the first row, interpolated linearly
             between readings; it has no columns if the log has only poses.
+        wheel_reading: what the angles were computed from.
         wheel_speed: reported speed of each wheel [rad/s], or None.
         wheel_speed_command: commanded speed of each wheel [rad/s], or None.
         twist_command: commanded x [m/s], y [m/s] and yaw rate [rad/s], or None.
@@ -52,6 +74,7 @@ class Log:
     sha256: str
     time: Float[np.ndarray, " time"]
     wheel_angle: Float[np.ndarray, "time wheel"]
+    wheel_reading: WheelReading = WheelReading()
     wheel_speed: Float[np.ndarray, "time wheel"] | None = None
     wheel_speed_command: Float[np.ndarray, "time wheel"] | None = None
     twist_command: Float[np.ndarray, "time 3"] | None = None

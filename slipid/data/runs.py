@@ -1,5 +1,6 @@
 """Class `Runs`: a set of runs of different lengths in one set of flat arrays."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -65,6 +66,27 @@ class Runs:
 
     def __len__(self) -> int:
         return len(self.logs)
+
+    def __repr__(self) -> str:
+        """Return counts and durations by floor and load set-up, the channels, and the sessions."""
+        wheels = self.wheel_angle.shape[1]
+        lines = [f"{counted(len(self), 'run')} of {counted(wheels, 'drive')}, {_spans(self.logs)}"]
+        groups: dict[tuple[str, str], list[Log]] = {}
+        for log in self.logs:
+            groups.setdefault((log.surface or "unknown floor", log.load), []).append(log)
+        rows = [
+            f"{floor}, {load}: {counted(len(logs), 'run')}, {_spans(logs)}"
+            for (floor, load), logs in sorted(groups.items())
+        ]
+        sessions = dict(Counter(self.session).most_common())
+        each = [f"{name} ({counted(runs, 'run')})" for name, runs in sessions.items()]
+        lines += _first(rows, "floors and load set-ups")
+        lines.append(f"channels: {', '.join(channels(self.logs))}")
+        lines.append(f"{counted(len(sessions), 'session')}:")
+        lines += _first(each, "sessions")
+        if self.aside:
+            lines += [f"{counted(len(self.aside), 'run')} set aside:", *_first(self.aside, "runs")]
+        return "\n".join(lines)
 
     def rows(self, run: int) -> slice:
         """Return the slice of the flat arrays that holds one run."""
@@ -150,6 +172,50 @@ def collect(
         turn=turn,
         aside=tuple(aside),
     )
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless the number is 1."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _spans(logs: Sequence[Log]) -> str:
+    """Return the total duration of runs, and the shortest and longest duration."""
+    seconds = [log.duration for log in logs]
+    total = sum(seconds)
+    whole = f"{total / 60:.1f} min" if total >= 60 else f"{total:.1f} s"
+    if len(seconds) == 1:
+        return whole
+    return f"{whole} ({min(seconds):.1f} to {max(seconds):.1f} s each)"
+
+
+_MOST_LINES = 7
+"""Largest number of lines of one list in the text of `Runs`."""
+
+
+def _first(lines: Sequence[str], noun: str) -> list[str]:
+    """Return the first lines of a list, indented; the last one counts the omitted ones, if any."""
+    shown = lines if len(lines) <= _MOST_LINES else lines[: _MOST_LINES - 1]
+    more = len(lines) - len(shown)
+    return [*(f"  {line}" for line in shown), *([f"  and {more} more {noun}"] if more else [])]
+
+
+_CHANNELS = (
+    *("wheel_speed", "wheel_speed_command", "twist_command", "current", "voltage"),
+    *("duty", "bus_voltage", "gyro", "pose"),
+)
+"""Channels of which the logged ones are listed, in this order."""
+
+
+def channels(logs: Sequence[Log]) -> list[str]:
+    """Return the names of the logged channels, with remarks such as "(3 of 5 runs)"."""
+    names = []
+    for name in _CHANNELS:
+        if count := sum(getattr(log, name) is not None for log in logs):
+            part = "" if count == len(logs) else f" ({count} of {len(logs)} runs)"
+            unsigned = name == "current" and not all(log.current_is_signed for log in logs)
+            names.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
+    return names
 
 
 def _fresh(logs: Sequence[Log], channel: str) -> Bool[np.ndarray, "sample wheel"] | None:

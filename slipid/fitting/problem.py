@@ -1,7 +1,7 @@
 """Posterior of a robot's parameters given windows of its runs, compiled once for each shape."""
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from glob import escape
 from typing import Any, NamedTuple
@@ -219,6 +219,18 @@ class Problem:
         jacobian = self.linear(z, self.electric(z, log_v))[1]
         information = variances.precision(self.objective, jacobian, log_v, keep, alone)
         return np.linalg.inv(np.asarray(information))
+
+    def laplaces(
+        self, z: Vector, log_v: Sequence[Vector], keep: Vector
+    ) -> Iterator[Float[np.ndarray, "free free"]]:
+        """Yield the covariance of the search vector for each of several sizes of the noise.
+
+        The Jacobian is shared, so that predictions of voltages assume the first size of the noise.
+        """
+        jacobian = self.linear(z, self.electric(z, log_v[0]))[1]
+        for one in log_v:
+            information = variances.precision(self.objective, jacobian, one, keep)
+            yield np.linalg.inv(np.asarray(information))
 
     def weighed(
         self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector

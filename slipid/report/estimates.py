@@ -143,23 +143,29 @@ def show_check(page: Page, found: Content) -> None:
         page.line(_clocks(found["clocks"]))
     for note, count in found["notes"].items():
         page.line(f"repaired in {count} runs: {note}")
-    title = (
-        "before a fit: expected information of the logs, for the least informative of the fit's "
-        "start values"
+    page.line(
+        "before a fit: what a fit may find, from the least to the most informative of plausible "
+        "floors, motors and noise; only the fit itself can find at bound or disputed"
     )
-    page.table(_expected(found["parameters"] | found["derived"], title))
+    page.table(_expected(found["parameters"] | found["derived"]))
     page.notes(found["messages"])
 
 
-def _expected(numbers: Mapping[str, Content], title: str) -> Table:
-    """Return the table of the ratios of expected posterior std to prior std of parameters."""
-    made = table(("parameter", "unit", "std after / before", "verdict"), title)
+def _expected(numbers: Mapping[str, Content], title: str | None = None) -> Table:
+    """Return the table of the ratios of expected posterior std to prior std of parameters.
+
+    If the estimates are ranges, the least informative end comes first.
+    """
+    made = table(("parameter", "unit", "std after / before", "expected verdict"), title)
     for path, e in numbers.items():
         if e["ratio"] is not None and "session_yaw" not in path:
             # The ratio of an electric parameter may exceed 1, since the uncertainty of the motion
             # is added to that of its prior.
-            ratio = f"{min(e['ratio'], 1.0):.3f}"
-            made.add_row(Text(path), e["unit"], ratio, verdict(e["verdict"]))
+            keys = (("ratio", "verdict"), ("best_ratio", "best_verdict"))
+            ends = [(min(e[ratio], 1.0), e[word]) for ratio, word in keys if ratio in e]
+            ratios = dict.fromkeys(f"{ratio:.3f}" for ratio, _ in ends)
+            words = dict.fromkeys(verdict(word) for _, word in ends)
+            made.add_row(Text(path), e["unit"], " .. ".join(ratios), " to ".join(words))
     return made
 
 

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import numpy as np
 import pytest
 
 from slipid.app.check import expected
@@ -54,6 +53,11 @@ def test_nothing_is_promised_that_the_fit_does_not_keep(times, creep):
         if e.verdict == "identified" and after[path].verdict in ORDER[:2]
     ]
     assert broken == []
-    promised = [ORDER.index(e.verdict) for e in before.values() if e.verdict in ORDER]
-    if times == 1:  # a promise that says nothing breaks nothing
-        assert np.max(promised) == 2
+    # the fit contradicts no more than one range in twenty
+    outside = [path for path, e in before.items() if not e.allows(after[path].verdict)]
+    assert len(outside) <= 0.05 * len(before), outside
+    # a range of all verdicts, which no fit contradicts, would say nothing
+    everything = [path for path, e in before.items() if all(map(e.allows, ORDER))]
+    assert len(everything) < 0.5 * len(before), everything
+    if times == 1:
+        assert any(e.best.verdict == "identified" for e in before.values())

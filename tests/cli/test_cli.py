@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.app.logs import packaged_config
+from slipid.app.config import read_config, single_floor_sections
+from slipid.app.logs import matching_files, packaged_config, packaged_path
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
@@ -296,6 +297,46 @@ def test_validate_reports_fitted_runs_and_unknown_floors(small, tmp_path):
     assert result.exit_code == 2
     assert "'ice'" in result.stderr
     assert "identified: soft" in result.stderr
+
+
+@pytest.mark.slow
+def test_validate_predicts_the_runs_that_a_glob_names(small, tmp_path):
+    folder, _ = small
+    target = tmp_path / "v.json"
+    words = ("validate", folder / "out", "--data", folder / "logs", "--logs")
+    result = invoke(*words, "as_built/soft/run00[12].csv", "--json", target)
+    assert result.exit_code == 0, result.stderr
+    runs = json.loads(target.read_text())["runs"]
+    assert sorted(run["name"] for run in runs) == [f"as_built/soft/run00{k}.csv" for k in (1, 2)]
+    ice = tmp_path / "as_built" / "ice" / "a.csv"
+    ice.parent.mkdir(parents=True)
+    ice.write_bytes((folder / "logs/as_built/soft/run000.csv").read_bytes())
+    result = invoke("validate", folder / "out", "--data", tmp_path, "--logs", "*/ice/*.csv")
+    assert result.exit_code == 2
+    assert "'ice'" in result.stderr
+    assert "identified: soft" in result.stderr
+    for glob, said in (
+        ("as_built/*/x*.csv", "no file matches 'as_built/*/x*.csv'; expected at least one"),
+        ("/tmp/*.csv", "--logs '/tmp/*.csv': "),
+    ):
+        result = invoke(*words, glob)
+        assert result.exit_code == 2
+        assert said in result.stderr
+
+
+def test_files_of_no_section_are_read_as_all_sections_say_and_refused_if_these_differ(tmp_path):
+    for name in ("new/a.csv", "one_surface/gray/b.csv"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).touch()
+    config = read_config(packaged_path("robotino2022.toml"))
+    one, other = single_floor_sections(config.content.logs)
+    found = matching_files(config, [one], tmp_path, "**/*.csv")
+    assert [(section, [path.name for path in paths]) for section, paths in found] == [
+        (one, ["b.csv"]),
+        (one, ["a.csv"]),
+    ]
+    with pytest.raises(DataError, match=r"new/a.csv: .* no section .* that match one of 'one_surf"):
+        matching_files(config, [one, other], tmp_path, "**/*.csv")
 
 
 @pytest.mark.slow

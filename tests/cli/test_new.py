@@ -5,11 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from slipid.app.config import read_config
 from slipid.cli.main import app
+from tests.helpers.made_bags import Message, write_bag
 from tests.helpers.made_tables import RADIUS, TRACK, plain, table
 from tests.helpers.shared import invoke
 
@@ -78,6 +80,43 @@ def test_a_log_is_looked_into(tmp_path):
     assert result.exit_code == 0, result.stderr
     assert '? drive: two drives: differential, or "skid"' in result.stdout
     assert "according to the poses it is about 0.1" in result.stdout
+
+
+def test_columns_that_are_not_used_stand_on_the_screen(tmp_path):
+    columns = {name: one for name, one in plain().items() if name != "yaw"}
+    columns |= {"gripper": columns["t"], "mode": np.full(len(columns["t"]), "auto")}
+    path = table(tmp_path / "run.csv", columns)
+    said = invoke("new", "--from", path, "--out", tmp_path / "mine.toml", *DIFFERENTIAL).stdout
+    assert "Not used: gripper, mode." in said
+    assert "Not used: pose_x: a pose needs x, y, and a heading or a quaternion" in said
+    assert "? of a pose only x (column x) and y (column y) was found: a fit needs" in said
+
+
+def test_topics_that_are_not_used_stand_on_the_screen_and_the_drive_has_two_wheels(tmp_path):
+    counts = [
+        Message(f"/drum_{k}", "std_msgs/msg/Int16", {"data": 7 * k}, 0.1 * at)
+        for at in range(20)
+        for k in (1, 2)
+    ]
+    write_bag(tmp_path / "run1", "mcap", counts)
+    out = tmp_path / "mine.toml"
+    said = invoke("new", "--from", tmp_path / "run1", "--out", out).stdout
+    for k in (1, 2):
+        assert f"Not used: /drum_{k} (std_msgs/msg/Int16): fields data" in said
+    assert read_config(out).content.robot.drive == "differential"
+
+
+@pytest.mark.parametrize(
+    ("wheels", "drive", "asked"), [(2, "differential", "skid"), (4, "skid", "mecanum or omni")]
+)
+def test_the_drive_follows_from_the_number_of_wheels(tmp_path, wheels, drive, asked):
+    columns = {name: one for name, one in plain().items() if name in ("t", "x", "y", "yaw")}
+    columns |= {f"wheel{k + 1}_vel": plain()["left_vel"] for k in range(wheels)}
+    out = tmp_path / "mine.toml"
+    said = invoke("new", "--from", table(tmp_path / "run.csv", columns), "--out", out).stdout
+    assert read_config(out).content.robot.drive == drive
+    (question,) = [line for line in said.splitlines() if line.startswith("  ? drive: ")]
+    assert asked in question
 
 
 def test_nothing_to_look_into_is_2(tmp_path):

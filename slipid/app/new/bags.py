@@ -234,9 +234,10 @@ def _unused(topics: Sequence[Topic], channels: Sequence[_TopicChannel]) -> tuple
     """Return a comment for each unused topic, with the fields of its messages."""
     used, notes = {one.topic.name for one in channels}, []
     for topic in topics:
-        if topic.name not in used and topic.count:
-            paths = [field.path for field in topic.fields if not field.path.startswith("header")]
-            fields = f" has {', '.join(paths[:8])}" if paths else ""
-            has = f": {topic.problem}" if topic.problem else fields
-            notes.append(f"Not used: {topic.name} ({topic.type}){has}")
+        if topic.name in used:
+            continue
+        paths = [field.path for field in topic.fields if not field.path.startswith("header")]
+        fields = f"fields {', '.join(paths[:8])}" if paths else ""
+        has = topic.problem or fields if topic.count else "no message"
+        notes.append(f"Not used: {topic.name} ({topic.type}){has and ': '}{has}")
     return tuple(notes)

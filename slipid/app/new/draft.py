@@ -51,6 +51,15 @@ class LayoutDraft:
     below: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
 
+    @property
+    def remarks(self) -> list[str]:
+        """Return the comments above the channels, and a line about each channel that is not used.
+
+        A channel that is not used because a question is open is not among them.
+        """
+        unused = (one for one in self.channels if one.commented_out and not one.question)
+        return [*self.above, *(f"Not used: {one.key}: {one.comment}" for one in unused)]
+
     def blocks(self) -> list[ConfigBlock]:
         """Return the tables of the layout and of its channels."""
         head = f"layouts.{self.name}"

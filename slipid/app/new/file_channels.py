@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.check.columns import refuse_misordered
-from slipid.data.reading.column_names import ColumnMeaning, meaning_of
+from slipid.data.reading.column_names import ColumnMeaning, meaning_of, stamp_columns
 from slipid.data.reading.layout import GROUPS, PER_WHEEL, TURNS, Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
@@ -37,7 +37,7 @@ class FileChannel:
         channel: name of the channel.
         columns: positions of its columns, from 0.
         labels: label of the wheel in the name of each column.
-        values: values of the columns, as in the file.
+        values: values of the columns, as in the file; a time has a single column.
         unit: unit in the names or in a row of units; empty if there is none.
         questions: one question about each assumption that was made.
     """
@@ -51,15 +51,20 @@ class FileChannel:
 
 
 Channels = tuple[list[FileChannel], list[str], list[str]]
-"""The channels of a file, the names of its other columns with numbers, and remarks for the user."""
+"""The channels of a file, the names of its other columns, and remarks for the user."""
 
 
 def channels_in(numbers: TableNumbers) -> Channels:
     """Return the channels in the named columns of a file."""
-    format, meanings = numbers.format, {}
+    format, meanings, width = numbers.format, {}, len(numbers.format.names)
     for at, name in enumerate(format.names):
         if at not in numbers.texts and name and not np.isnan(numbers.values[:, at]).all():
             meanings[at] = meaning_of(name, format.units[at])
+    stamp = stamp_columns([format.names[at] if at in meanings else "" for at in range(width)])
+    if stamp and not any(m.channel == "time" for at, m in meanings.items() if at not in stamp):
+        meanings |= dict.fromkeys(stamp, ColumnMeaning())
+    else:
+        stamp = None
     channels: dict[str, dict[str, int]] = {}
     also: list[str] = []
     for at, one in meanings.items():
@@ -71,6 +76,9 @@ def channels_in(numbers: TableNumbers) -> Channels:
         else:
             there[one.label] = at
     found = [_file_channel(numbers, meanings, name, places) for name, places in channels.items()]
+    if stamp:
+        seconds = numbers.values[:, stamp] @ [[1.0], [1e-9]]
+        found.append(FileChannel("time", stamp, ("", ""), seconds, "s"))
     first: dict[str, FileChannel] = {}
     for resolved in _resolved(found):
         first.setdefault(resolved.channel, resolved)
@@ -83,7 +91,7 @@ def channels_in(numbers: TableNumbers) -> Channels:
         notes.append(f"not used, a second column: {', '.join(also)}")
     kept, dropped = _consistent(list(first.values()))
     used = {at for one in kept for at in one.columns}
-    unused = [format.names[at] for at in meanings if at not in used]
+    unused = [name for at, name in enumerate(format.names) if name and at not in used]
     return kept, unused, notes + dropped
 
 

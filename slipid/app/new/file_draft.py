@@ -193,7 +193,7 @@ def _unusable(found: FileChannel, run: RunStudy) -> dict[str, str] | None:
     if channel == "bus_voltage" and run.find("duty") is None:
         return {"comment": "used only together with a duty cycle"}
     if channel.startswith("pose_") and not run.has_pose:
-        return {"comment": "not used: a pose needs x, y and a heading"}
+        return {"comment": "a pose needs x, y, and a heading or a quaternion"}
     if channel.startswith("pose_") and run.place_unit.unit in PIXELS:
         return {"question": "give metres_per_pixel in the layout" if channel == "pose_x" else ""}
     return None
@@ -227,7 +227,7 @@ def unit_of(one: FileStudy, found: FileChannel, run: RunStudy, robot: RobotAnswe
     if channel == "current":
         return current_unit(most)
     if channel == "duty":
-        return duty_unit(most)
+        return duty_unit(found.values)
     if channel.startswith("twist_command") and channel != "twist_command_yaw":
         return UnitGuess("m/s") if most < 20 else UnitGuess("mm/s", f"up to {most:.4g}")
     if channel in ("twist_command_yaw", "gyro"):

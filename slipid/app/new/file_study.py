@@ -36,7 +36,7 @@ class FileStudy:
     Attributes:
         numbers: numbers in the file.
         found: channels in the file.
-        unused: names of the other columns with numbers.
+        unused: names of the other columns.
         notes: remarks for the user.
         time: time of every row [s]; if no time is logged, the number of the row.
         clock: unit of the time; None if no time is logged.

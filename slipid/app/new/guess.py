@@ -73,9 +73,11 @@ def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
         return drive, f"four wheels{moves}: skid, mecanum or omni, in which order of the columns?"
     if wheels > 4:
         return "general", f"{wheels} wheels: where do they stand, in the order of the columns?"
+    # Without a known number of wheels, the drive with the fewest wheels is assumed.
+    drive = "omni" if aside else "differential"
     if wheels == 1:
-        return "omni", "one column of wheels only: a motor on a bench (slipid motor FILE), or more?"
-    return "omni", "no column has the wheels' motion: which drive is it, and how many wheels?"
+        return drive, "one column of wheels only: a motor on a bench (slipid motor FILE), or more?"
+    return drive, "the wheels' motion was not recognised: which drive is it, and how many wheels?"
 
 
 def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:

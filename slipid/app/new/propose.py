@@ -18,7 +18,7 @@ from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.bag.runs import PAUSE_S, runs_between_pauses
-from slipid.data.reading.layout import TURNS, Layout
+from slipid.data.reading.layout import GROUPS, TURNS, Layout
 from slipid.data.reading.motor_layout import motor_layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
@@ -74,7 +74,7 @@ def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[F
         return
     first = files[0].format.path
     try:
-        guessed = motor_layout(files[0].format, {}, signed=True)
+        guessed = motor_layout(files[0].format, {}, signed=True, pole_pairs=1.0)
     except DataError:
         return
     channels = ", ".join(channel.removeprefix("motor_") for channel in guessed.channels)
@@ -102,13 +102,25 @@ def _layouts(run: RunStudy, robot: RobotAnswers, name: str) -> list[LayoutDraft]
     """Return the drafts of the layouts of all files of a run."""
     first = file_draft(name, run.main, run, robot, COLUMNS_HELP)
     if not run.has_pose:
-        ask = "no pose was found (x, y, and a heading or a quaternion): a fit needs one"
-        first = replace(first, questions=(*first.questions, ask))
+        first = replace(first, questions=(*first.questions, _missing_pose(run)))
     beside = (
         (f"{name}.beside.{toml(pattern)}", one, f"Of the same run, in {pattern}:")
         for pattern, one in run.beside
     )
     return [first, *(file_draft(key, one, run, robot, (help,)) for key, one, help in beside)]
+
+
+def _missing_pose(run: RunStudy) -> str:
+    """Return the question about the pose of a run without a whole pose, with what was found."""
+    needed = "a fit needs x, y, and a heading or a quaternion"
+    parts = [
+        f"{name.removeprefix('pose_')} (column {one.format.column(found.columns[0])})"
+        for name in (*GROUPS["pose"], "pose_quaternion")
+        for one in run.all
+        if (found := one.find(name)) is not None
+    ]
+    only = f"of a pose only {' and '.join(parts)} was found" if parts else "no pose was found"
+    return f"{only}: {needed}"
 
 
 def _name(number: int) -> str:

@@ -177,8 +177,19 @@ def current_unit(most: float) -> UnitGuess:
     return UnitGuess("A", f"up to {most:.3g}")
 
 
-def duty_unit(most: float) -> UnitGuess:
-    """Return a guess of the unit of duty cycles, from their largest magnitude."""
+def duty_unit(values: Float[np.ndarray, "row column"]) -> UnitGuess:
+    """Return a guess of the unit of duty cycles, from their size.
+
+    Whole numbers may be percent or the counts of a timer, such as 0 to 255, which is asked.
+    """
+    known = values[~np.isnan(values)]
+    most = float(np.abs(known).max(initial=0.0))
+    if 1.05 < most < 256 and most != 100 and (known == np.round(known)).all():
+        ask = (
+            f"whole numbers up to {most:g}: counts of 0 to 255 (then scale = {1 / 255:.6f}), or "
+            'percent (then unit = "percent")?'
+        )
+        return UnitGuess("1", doubt=ask)
     if most <= 1.05:
         return UnitGuess("1", f"up to {most:.3g}")
     if most <= 105:

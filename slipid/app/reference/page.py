@@ -137,6 +137,8 @@ def _channels(_: object) -> str:
 def _columns(channel: str) -> str:
     if channel in SEVERAL:
         return "four: x, y, z, w"
+    if channel == "time":
+        return "one, or two: seconds and nanoseconds"
     return "one per wheel, or per motor" if channel in PER_WHEEL else "one"
 
 

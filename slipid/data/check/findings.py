@@ -11,6 +11,7 @@ from typing import Literal
 from slipid.data.check.joined import PoseConvention
 from slipid.data.check.mistakes import Candidate, Mistake
 from slipid.data.check.ratios import QUANTITIES, ScaleCause, ScaleRatio
+from slipid.data.log import WheelReading
 from slipid.support.content import Content
 
 Severity = Literal["wrong", "suspicious", "note"]
@@ -177,8 +178,46 @@ def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
     return Finding(kind, _CONVENTION_SENTENCES[kind], remedy)
 
 
+def ticks_finding(
+    ticks: float | None, scales: Mapping[str, ScaleRatio], reading: WheelReading
+) -> Finding:
+    """Return the finding that angles of the wheels, declared in radians, are ticks.
+
+    Args:
+        ticks: ticks per radian as logged, divided by the gear ratio of a motor's angle; None if
+            nothing was logged that tells it.
+        scales: ratios by name.
+        reading: what the angles were computed from.
+    """
+    remedy = (
+        f"name the columns in the channel wheel_ticks instead of {reading.channel}, with unit = "
+        "'tick', and give ticks_per_revolution, the ticks in a turn of the motor shaft"
+    )
+    found = f"the channel {reading.channel} has whole numbers only, as ticks have, not radians"
+    if ticks is None:
+        return Finding("wheel_ticks", found, remedy, "suspicious")
+    per_rad = ticks * reading.divided_by
+    per_turn = 2 * pi * per_rad / reading.gear_ratio
+    return Finding(
+        "wheel_ticks",
+        f"positions look like ticks (about {_rounded(per_rad)} per rad of wheel): {found}, and "
+        f"{ratio_sentence(scales)}",
+        f"{remedy} (about {_rounded(per_turn)} with the layout's gear_ratio = "
+        f"{reading.gear_ratio:g})",
+    )
+
+
+def _rounded(value: float) -> str:
+    """Return a number with three digits that count, without an exponent."""
+    return f"{float(f'{value:.3g}'):.10g}"
+
+
 def cause_findings(
-    fitting: Sequence[ScaleCause], single: bool, scales: Mapping[str, ScaleRatio], gear_ratio: float
+    fitting: Sequence[ScaleCause],
+    single: bool,
+    scales: Mapping[str, ScaleRatio],
+    gear_ratio: float,
+    reading: WheelReading,
 ) -> tuple[Finding, ...]:
     """Return findings about wrong factors, from ratios outside their ranges.
 
@@ -190,6 +229,7 @@ def cause_findings(
         single: True if each of these causes explains all ratios without another cause.
         scales: ratios by name.
         gear_ratio: gear ratio of the declared robot.
+        reading: what the wheels' angle was computed from.
     """
     why = ratio_sentence(scales)
     if not fitting:
@@ -201,8 +241,8 @@ def cause_findings(
         )
         return (found,) if why else ()
     if not single:
-        return tuple(_factor_finding(one, gear_ratio).explained(why) for one in fitting)
-    first, *others = (_factor_finding(one, gear_ratio) for one in fitting)
+        return tuple(_factor_finding(one, gear_ratio, reading).explained(why) for one in fitting)
+    first, *others = (_factor_finding(one, gear_ratio, reading) for one in fitting)
     likely = [
         other
         for other, cause in zip(others, fitting[1:], strict=True)
@@ -225,7 +265,7 @@ def ratio_sentence(known: Mapping[str, ScaleRatio]) -> str:
     return ", ".join(sentences[k].format(r.value) for k, r in known.items() if not r.natural)
 
 
-def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
+def _factor_finding(cause: ScaleCause, gear_ratio: float, reading: WheelReading) -> Finding:
     """Return the finding about a quantity that is too large or too small by a factor."""
     factor, (kind, channel, *_) = cause.factor, QUANTITIES[cause.name]
     ratio = f"{max(factor, 1 / factor):.3g}"
@@ -243,11 +283,10 @@ def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
         remedy = f"set unit = '{'deg' if factor > 1 else 'rad'}' for the channel pose_heading"
     elif cause.name == "wheel_radius":
         found = f"wheel_radius_m is {size}, or the rotation of the wheels is"
-        remedy = (
-            f"divide wheel_radius_m in [robot] by {factor:.3g}, or {_turns(factor, gear_ratio)}"
-        )
+        turns = _turns(factor, gear_ratio, reading)
+        remedy = f"divide wheel_radius_m in [robot] by {factor:.3g}, or {turns}"
     elif kind == "wheel_scale":
-        remedy = _turns(factor, gear_ratio)
+        remedy = _turns(factor, gear_ratio, reading)
     elif cause.name == "base":
         found = (
             f"{channel} is {'more' if factor > 1 else 'less'} than declared, by a factor of {ratio}"
@@ -262,15 +301,35 @@ def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
     return Finding(kind, found, remedy)
 
 
-def _turns(factor: float, gear_ratio: float) -> str:
-    """Return the remedy for a logged rotation of the wheels that is too large by a factor."""
+def _turns(factor: float, gear_ratio: float, reading: WheelReading) -> str:
+    """Return the remedy for a logged rotation of the wheels that is too large by a factor.
+
+    A gear ratio that the layout has already is not advised.
+    """
+    geared = isclose(reading.divided_by, gear_ratio, rel_tol=0.02)
+    of_wheel = reading.channel in ("wheel_angle", "wheel_speed")
     remedies = [f"multiply ticks_per_revolution or the layout's gear_ratio by {factor:.3g}"]
-    if gear_ratio > 1.5 and isclose(1 / factor, gear_ratio, rel_tol=0.02):
+    if of_wheel:
+        remedies = [f"correct unit or scale of {reading.channel} (scale = {1 / factor:.3g})"]
+    elif reading.channel.startswith("motor"):
+        remedies = [f"multiply the layout's gear_ratio by {factor:.3g}"]
+    forgotten = gear_ratio > 1.5 and isclose(factor, gear_ratio, rel_tol=0.02)
+    if forgotten and of_wheel:
+        other = reading.channel.replace("wheel", "motor")
+        remedies = [
+            f"name the columns in the channel {other} instead of {reading.channel}, with "
+            f"gear_ratio = {gear_ratio:g} in the layout: the encoder is at the motor"
+        ]
+    elif forgotten and not geared:
+        remedies = [f"set gear_ratio = {gear_ratio:g} in the layout: the encoder is at the motor"]
+    elif (
+        (geared or not reading.channel)
+        and gear_ratio > 1.5
+        and isclose(1 / factor, gear_ratio, rel_tol=0.02)
+    ):
         remedies = [
             "set gear_ratio = 1 in the layout, if the encoder is at the wheel, not the motor"
         ]
-    elif gear_ratio > 1.5 and isclose(factor, gear_ratio, rel_tol=0.02):
-        remedies = [f"set gear_ratio = {gear_ratio:g} in the layout: the encoder is at the motor"]
     if unit := _unit_of_rate(factor):
         remedies.append("correct the unit, if wheels are logged as speeds or angles" + unit)
     return ", or ".join(remedies)

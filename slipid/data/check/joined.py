@@ -19,7 +19,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.data.log import Log
+from slipid.data.log import Log, WheelReading
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_increments, integral, interpolate
 
@@ -66,6 +66,7 @@ class JoinedRuns:
             integrals [rad, m] of the rates in `INTEGRATED`, and values of currents [A] and voltages
             [V].
         current_is_signed: False if some run has only magnitudes of currents.
+        reading: what the angles were computed from; `whole` holds for all runs.
     """
 
     names: tuple[str, ...]
@@ -76,6 +77,7 @@ class JoinedRuns:
     pose: JoinedChannel
     channels: Mapping[str, JoinedChannel]
     current_is_signed: bool
+    reading: WheelReading
 
     @property
     def wheels(self) -> int:
@@ -150,6 +152,9 @@ def joined(data: Runs) -> JoinedRuns:
         pose=JoinedChannel(time[fresh], data.pose[fresh]),
         channels=channels,
         current_is_signed=data.current_is_signed,
+        reading=replace(
+            data.logs[0].wheel_reading, whole=all(log.wheel_reading.whole for log in data.logs)
+        ),
     )
 
 

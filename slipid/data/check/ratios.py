@@ -20,7 +20,7 @@ factor is a common error, such as 1000, 2 pi, 57.3 or the gear ratio, are prefer
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import exp, inf, log, pi
+from math import exp, inf, isclose, log, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +36,7 @@ from slipid.data.check.joined import (
     rotation,
     usable,
 )
+from slipid.data.log import WheelReading
 
 LEAST_TURNING = 0.01
 """Least fraction of rotation in the predicted motion for which rotations are compared [1]."""
@@ -252,6 +253,7 @@ QUANTITIES: Mapping[str, ScaledQuantity] = {
     ),
 }
 """Quantities by name, the likeliest to be wrong first."""
+_WHEEL_SCALES = {name for name, one in QUANTITIES.items() if one.kind == "wheel_scale"}
 _BY_GEAR = ("wheel_gear", "wheel_turns", "command_wheels", "report")
 """Quantities for which the gear ratio is a common factor as well."""
 
@@ -270,8 +272,47 @@ class ScaleCause(NamedTuple):
     common: bool
 
 
+_NEAR_UNIT = log(1.4)
+"""Largest logarithm of a ratio by which a reported speed may differ from that of the wheels, in
+some unit, for the number of ticks per radian to follow from it [1]."""
+
+
+def ticks_per_radian(known: Mapping[str, ScaleRatio]) -> float | None:
+    """Return the ticks per radian of the wheels if their angle is in ticks; None if in radians.
+
+    The number follows from the motion of the body, and is refined by the reported speeds, which do
+    not depend on slip.
+    """
+    of_wheels = [known[name] for name in _OF_WHEELS | {"command": 0} if name in known]
+    if not of_wheels or all(ratio.natural for ratio in of_wheels):
+        return None
+    ticks = 1.0 / of_wheels[0].value
+    if "report" in known:
+        likely = ticks * of_wheels[0].usual
+        units = [1.0, *_RATES, *(1 / rate for rate in _RATES)]
+        apart = {unit: abs(log(known["report"].value * likely / unit)) for unit in units}
+        unit = min(units, key=lambda unit: apart[unit])
+        if apart[unit] < _NEAR_UNIT:
+            ticks = unit / known["report"].value
+    return ticks
+
+
+def without_factor(
+    known: Mapping[str, ScaleRatio], powers: Mapping[str, float], factor: float
+) -> dict[str, ScaleRatio]:
+    """Return the ratios as they are once a quantity with these powers is divided by a factor."""
+    return {
+        name: replace(r, value=r.value / factor ** powers.get(name, 0.0))
+        for name, r in known.items()
+    }
+
+
 def single_causes(
-    known: Mapping[str, ScaleRatio], speed_is_angle: bool, row_s: float, gear_ratio: float
+    known: Mapping[str, ScaleRatio],
+    speed_is_angle: bool,
+    row_s: float,
+    gear_ratio: float,
+    reading: WheelReading,
 ) -> tuple[tuple[ScaleCause, ...], bool]:
     """Return the causes that explain the ratios, the likeliest first, and whether one suffices.
 
@@ -283,30 +324,33 @@ def single_causes(
         speed_is_angle: True if the wheels' angle was integrated from their speeds.
         row_s: median time between rows [s].
         gear_ratio: declared gear ratio.
+        reading: what the wheels' angle was computed from.
     """
     if all(r.natural for r in known.values()):
         return (), True
-    possible = _possible(speed_is_angle, gear_ratio)
+    possible = _possible(speed_is_angle, gear_ratio, reading)
     if USUAL_ROW_S[0] <= row_s <= USUAL_ROW_S[1]:
         del possible["time"]
     if single := _singles(known, possible):
         return tuple(sorted(single, key=lambda e: not e.common)), True
     for first, quantity in possible.items():
         for factor in quantity.common:
-            left = {
-                name: replace(r, value=r.value / factor ** quantity.powers.get(name, 0.0))
-                for name, r in known.items()
-            }
-            rest = {name: other for name, other in possible.items() if name != first}
+            left = without_factor(known, quantity.powers, factor)
+            # Two wrong factors of the wheels' angle, or of angle and radius, would be one.
+            twice = {first} if quantity.kind != "wheel_scale" else _WHEEL_SCALES
+            rest = {name: other for name, other in possible.items() if name not in twice}
             if second := [e for e in _singles(left, rest) if e.common]:
                 return (ScaleCause(first, factor, True), second[0]), False
     return (), False
 
 
-def _possible(speed_is_angle: bool, gear_ratio: float) -> dict[str, ScaledQuantity]:
+def _possible(
+    speed_is_angle: bool, gear_ratio: float, reading: WheelReading
+) -> dict[str, ScaledQuantity]:
     """Return the quantities by name, with all their common factors.
 
-    The arguments are those of `single_causes`.
+    The arguments are those of `single_causes`. The gear ratio is no common factor of the wheels'
+    angle where the layout has divided by it already, and its inverse only where it has.
     """
     found = dict(QUANTITIES)
     if speed_is_angle:
@@ -315,9 +359,13 @@ def _possible(speed_is_angle: bool, gear_ratio: float) -> dict[str, ScaledQuanti
         of_rates = (30 / pi, 180 / pi, 2 * pi, 1000.0, 60.0)
         found["wheel_gear"] = found["wheel_gear"]._replace(common=of_rates)
     for name, quantity in found.items():
-        gear = (gear_ratio,) if name in _BY_GEAR and gear_ratio > 1.5 else ()
-        both = tuple(f for one in (*gear, *quantity.common) for f in (one, 1 / one))
-        found[name] = quantity._replace(common=both)
+        both = tuple(f for one in quantity.common for f in (one, 1 / one))
+        gear: tuple[float, ...] = ()
+        if name in _BY_GEAR and gear_ratio > 1.5:
+            gear = (gear_ratio, 1 / gear_ratio)
+        if gear and name in _WHEEL_SCALES and reading.channel:
+            gear = gear[1:] if isclose(reading.divided_by, gear_ratio) else gear[:1]
+        found[name] = quantity._replace(common=(*gear, *both))
     return found
 
 

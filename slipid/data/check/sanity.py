@@ -3,13 +3,13 @@
 Encoders, commands, gyro, currents and poses must agree with each other and with the geometry in the
 config. Single runs are searched for constant poses and for poses of another run.
 
-Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_speed_unit`,
-`heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
-`pose_mirrored`, `pose_length`, `pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`,
-`base_radius`, `time_unit`, `current_sign`, `current_order`, `current_unit`, `current_of_supply`,
-`voltage_sign`, `voltage_order`, `voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`,
-`command_order`, `command_unit`, `command_exchanged`, `wheel_columns`, `scales`, `travel`,
-`not_checked`.
+Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_ticks`,
+`wheel_speed_unit`, `heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`,
+`pose_axis`, `pose_swapped`, `pose_mirrored`, `pose_length`, `pose_constant`, `pose_of_another_run`,
+`pose_unexplained`, `lag`, `base_radius`, `time_unit`, `current_sign`, `current_order`,
+`current_unit`, `current_of_supply`, `voltage_sign`, `voltage_order`, `voltage_unit`, `gyro_sign`,
+`gyro_unit`, `command_sign`, `command_order`, `command_unit`, `command_exchanged`, `wheel_columns`,
+`scales`, `travel`, `not_checked`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,6 +30,7 @@ from slipid.data.check.findings import (
     Finding,
     cause_findings,
     mistake_finding,
+    ticks_finding,
     worst_first,
 )
 from slipid.data.check.interpretation import Evidence, Interpretation, gather, misfits, to_body
@@ -48,9 +49,12 @@ from slipid.data.check.mistakes import mistakes
 from slipid.data.check.ratios import (
     LEAST_TRANSLATION,
     LEAST_TURNING,
+    QUANTITIES,
     ScaleRatio,
     ratios,
     single_causes,
+    ticks_per_radian,
+    without_factor,
 )
 from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
@@ -125,8 +129,13 @@ def _all(runs: Runs, geometry: Geometry, mass_kg: float | None) -> Iterator[Find
     if not found.poses:
         scales = {k: r for k, r in scales.items() if k not in ("travel", "turning", "gyro")}
     radius, gear_ratio = float(geometry.wheel_radius), float(geometry.gear_ratio)
-    causes = single_causes(scales, speed_is_angle, float(np.median(data.row)), gear_ratio)
-    factors = cause_findings(*causes, scales, gear_ratio)
+    reading, ticks = data.reading, ticks_per_radian(scales)
+    if reading.whole and (ticks is not None or not scales.keys() - {"report", "gyro"}):
+        yield ticks_finding(ticks, scales, reading)
+        scales = without_factor(scales, QUANTITIES["wheel_turns"].powers, ticks or 1.0)
+    row = float(np.median(data.row))
+    causes = single_causes(scales, speed_is_angle, row, gear_ratio, reading)
+    factors = cause_findings(*causes, scales, gear_ratio, reading)
     factors = factors or tuple(_of_time(data, found.moved, at, radius))
     yield from factors
     yield from electric(data, found.meant, radius, mass_kg, not factors)

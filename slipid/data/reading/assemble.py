@@ -13,13 +13,15 @@ from jaxtyping import Bool, Float
 
 from slipid.data.align.clock import Clock, best_clock
 from slipid.data.align.regression import MotionPair
-from slipid.data.log import Log
+from slipid.data.log import Log, WheelReading
 from slipid.data.reading.checks import UnusablePose
 from slipid.data.reading.layout import GROUPS, TURNS, SensorLayout
 from slipid.data.reading.signal import RawRun, Signal, clock_of, first_true
 from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
 
+_FEWEST_TICKS = 20
+"""Least number of different whole numbers for which angles may be ticks."""
 EPOCH = 1e6
 """Times above this are counted from 1970, not from the start of the robot [s]."""
 
@@ -55,6 +57,7 @@ def assembled(run: RawRun, layout: SensorLayout) -> Log:
         **vars(run.identity),
         time=clock - start,
         wheel_angle=angle,
+        wheel_reading=_reading(turns, signals, layout),
         wheel_speed=held.get("wheel_speed"),
         wheel_speed_command=held.get("wheel_speed_command"),
         twist_command=_twist(held, len(clock)),
@@ -135,9 +138,7 @@ def _angle(
     for values in signal.values.T:
         there = ~np.isnan(values)
         time, values = signal.time[there], values[there]
-        if name == "wheel_ticks":
-            values = _ticks(values, layout, notes)
-        elif name.endswith("speed"):
+        if name.endswith("speed"):
             read = readings(time, values)
             slow += not read.all()
             time, values = time[read], values[read]
@@ -153,30 +154,21 @@ def _angle(
     return angle - angle[0]
 
 
+def _reading(name: str | None, signals: Mapping[str, Signal], layout: SensorLayout) -> WheelReading:
+    """Return what the angles of the wheels are computed from: the channel `name`."""
+    if name is None:
+        return WheelReading()
+    values = signals[name].values[~np.isnan(signals[name].values)]
+    whole = name.endswith("angle") and bool((values == np.round(values)).all())
+    whole = whole and len(np.unique(values)) >= _FEWEST_TICKS
+    return WheelReading(name, layout.gear_ratio, whole)
+
+
 def per_wheel(name: str, layout: SensorLayout) -> float:
     """Return the angle of the wheel per tick [rad], or per angle at the measured shaft [1]."""
     if name == "wheel_ticks":
         return 2.0 * np.pi / (float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio)
     return 1.0 / layout.gear_ratio if name.startswith("motor") else 1.0
-
-
-def _ticks(
-    ticks: Float[np.ndarray, " sample"], layout: SensorLayout, notes: list[str]
-) -> Float[np.ndarray, " sample"]:
-    """Return the cumulative ticks of one wheel.
-
-    Increments are summed; the wrap-around of a counter of `tick_bits` bits is removed, with a note.
-    """
-    if layout.ticks_are_increments:
-        return np.cumsum(ticks)
-    period = 2.0**layout.tick_bits
-    steps = np.diff(ticks)
-    if np.abs(steps).max(initial=0.0) <= 0.5 * period:
-        return ticks
-    note = f"the wrap-around of the tick counter at {layout.tick_bits} bits was removed"
-    if note not in notes:
-        notes.append(note)
-    return ticks - period * np.concatenate([[0.0], np.cumsum(np.round(steps / period))])
 
 
 def _of_wheels(signals: Mapping[str, Signal], layout: SensorLayout) -> dict[str, Signal]:

@@ -1,6 +1,7 @@
 """Dictionary of words in column and topic names, from which the channel and unit are guessed."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
@@ -36,7 +37,7 @@ _TABLE: dict[str, str] = {
     "what voltage": "volt volts voltage voltages u spannung",
     "what duty": "duty pwm dutycycle throttle",
     "what battery": "bat batt battery bus supply vbat vbatt vbus ubat ubus",
-    "what rpm": "rpm",
+    "what rpm": "rpm erpm",
     "what gyro": "gyro gyroscope gz",
     "what yaw": "yaw heading theta th psi bearing hdg",
     "what angle": "angle angles ang phi rot rotation rotational",
@@ -56,7 +57,7 @@ _TABLE: dict[str, str] = {
         "data field fields msg value values actual measured meas feedback fb state states link "
         "robot base body global world map camera cam mocap vicon optitrack tag marker tracker "
         "lidar slam imu header twist coordinate coordinates coord axis of the from to in at along "
-        "log sensor drive shaft nsec sec secs ros"
+        "log sensor drive shaft nsec sec secs ros cycle today"
     ),
 }
 """Words in column names, by role and value: the key `side l` is the role `side` with value `l`."""
@@ -87,6 +88,16 @@ _SHORT = ("v", "a", "s", "m")
 ending as a word, has no meaning."""
 
 
+_OF_VESC = {
+    "ms_today": ("time", "ms"),
+    "input_voltage": ("bus_voltage", "V"),
+    "current_motor": ("current", "A"),
+    "current_in": ("", ""),
+}
+"""Channels and units of columns that VESC tool, which logs a motor's controller, gives a name of
+its own."""
+
+
 @dataclass(frozen=True)
 class ColumnMeaning:
     """Meaning of the name of a column.
@@ -107,6 +118,32 @@ class ColumnMeaning:
     doubt: str = ""
 
 
+def stamp_columns(names: Sequence[str]) -> tuple[int, int] | None:
+    """Return the positions of two columns that together are a time, or None if there are none.
+
+    They have the seconds and the nanoseconds of a stamp, such as `stamp.sec` and `stamp.nanosec`.
+    """
+    at = {name.lower(): k for k, name in enumerate(names)}
+    for name, seconds in at.items():
+        if (found := re.fullmatch(r"(|.*[^a-z])s(|ec|ecs|econds)", name)) is None:
+            continue
+        roles = {(role, value) for role, value, _ in name_parts(found[1]).roles}
+        if not roles <= {("what", "time"), ("noise", "")} or name_parts(found[1]).unknown:
+            continue
+        for part in ("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"):
+            if found[1] + part in at:
+                return seconds, at[found[1] + part]
+    return None
+
+
+def _without_prefix(name: str) -> str:
+    """Return a name such as `/vrpn/robot/pose/x` without the first parts that mean nothing."""
+    parts = name.strip("/").split("/")
+    while len(parts) > 1 and all(role == "noise" for role, _, _ in name_parts(parts[0]).roles):
+        parts = parts[1:]
+    return "/".join(parts)
+
+
 def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMeaning:
     """Return the meaning of a column or of a topic's field by its name.
 
@@ -116,12 +153,16 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
         of_motor: True if the log is that of motors on a bench, whose columns need not name a wheel
             or motor.
     """
+    if of_motor and (exact := _OF_VESC.get(name.lower())):
+        return ColumnMeaning(exact[0], "", exact[1])
     bare, suffix = without_unit(name)
     unit = unit_in(unit) or unit or suffix
     texts = [bare] if "[" in name or "(" in name or "," in name else [bare, name]
     # An ending such as v may be a word (speed) instead of a unit: the whole name is tried first.
     if name[len(bare) :].lower()[1:] in _SHORT:
         texts.reverse()
+    if "/" in bare and (inside := _without_prefix(bare)) != bare:
+        texts.append(inside)
     tried = [(name_parts(text), strict) for strict in (True, False) for text in texts]
     for parts, strict in tried:
         if strict and (parts.unknown or parts.mended):
@@ -261,8 +302,15 @@ def _apart(word: str) -> list[str]:
     return found
 
 
+def is_electrical(name: str) -> bool:
+    """Return whether a column has the speed of a motor's field: the shaft's times pole pairs."""
+    return "erpm" in name_parts(name).words("rpm")
+
+
 def _doubt(parts: NameParts, channel: str) -> str:
     """Return a question about an assumption that was made about a name, empty if none was made."""
+    if "erpm" in parts.words("rpm"):
+        return "erpm is the shaft's speed times the motor's pole pairs: give scale = 1 / pole pairs"
     if channel.startswith("twist") and not parts.has("what", "command"):
         return "is it a command? Measured speeds must not be used here"
     if parts.mended:
@@ -276,7 +324,7 @@ def _doubt(parts: NameParts, channel: str) -> str:
 
 def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
     """Return the channel and the label of a name, or None if it has no known meaning."""
-    if parts.has("not"):
+    if parts.has("not") or _of_axis(parts):
         return ("odometry", "") if parts.has("not", "odometry") else None
     label = _label(parts)
     single = _single(parts)
@@ -292,9 +340,15 @@ def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
     return f"{'motor' if parts.has('kind', 'motor') else 'wheel'}_{what}", label
 
 
+def _of_axis(parts: NameParts) -> bool:
+    """Return whether a name is that of a current or voltage along the axis d or q of a motor."""
+    electric = parts.has("what", "current", "voltage")
+    return electric and any(word in ("d", "q") for _, _, word in parts.roles)
+
+
 def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
     """Return the channel and the label of a name in a log of motors on a bench, or None."""
-    if parts.has("not"):
+    if parts.has("not") or _of_axis(parts):
         return None
     single = _single(parts)
     if single and single[0] in ("time", "bus_voltage"):

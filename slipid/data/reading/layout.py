@@ -71,8 +71,9 @@ class Channel:
     """Columns of one channel: value = (scale x cell + offset), in `unit`.
 
     Attributes:
-        columns: names of the columns (one per wheel for channels of wheels), or, in a file without
-            column names, their positions counted from 0.
+        columns: names of the columns (one per wheel for channels of wheels; for a time, a second
+            one may have nanoseconds), or, in a file without column names, their positions counted
+            from 0.
         unit: unit of the numbers in the file; `pixel` is converted to metres by `metres_per_pixel`
             of the layout.
         scale: factor on the numbers, such as -1 for a reversed sign: one number for all columns, or

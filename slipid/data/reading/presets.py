@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SINGLE, Channel, Layout, unknown
+from slipid.data.reading.units import same_unit
 from slipid.support.errors import DataError
 from slipid.support.toml_file import checked
 
@@ -236,7 +237,11 @@ def _file_problem(layout: Layout) -> str | None:
         return f"no columns; expected a table of channels ({', '.join(CHANNELS)})"
     if "time" not in have and layout.row_period is None:
         return "no time column; expected a channel 'time', or row_period in seconds"
-    if many := [name for name, count in single.items() if count != 1]:
+    if single.get("time") == 2 and not same_unit(have["time"].unit, "s"):
+        return (
+            f"columns.time: seconds and nanoseconds in '{have['time'].unit}'; expected unit = 's'"
+        )
+    if many := [n for n, count in single.items() if count != 1 and (n, count) != ("time", 2)]:
         return f"columns.{many[0]}: {single[many[0]]} columns; expected one column"
     if "pose_quaternion" in have and len(have["pose_quaternion"].columns) != 4:
         count = len(have["pose_quaternion"].columns)

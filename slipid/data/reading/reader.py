@@ -18,7 +18,14 @@ from slipid.data.reading.bag.topics import read_bag
 from slipid.data.reading.checks import MIN_ROWS, UnusablePose, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
-from slipid.data.reading.signal import Identity, RawRun, Signal, SignalSource, heading
+from slipid.data.reading.signal import (
+    Identity,
+    RawRun,
+    Signal,
+    SignalSource,
+    cumulative_ticks,
+    heading,
+)
 from slipid.data.reading.table import Table, read_table
 from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError, first_names
@@ -223,7 +230,7 @@ def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
 def _run_starts(table: Table, layout: Layout) -> list[int]:
     """Return the first row of every run."""
     if layout.new_run == "time_restarts":
-        time = table.stacked(layout.channels["time"])[:, 0]
+        time = _time(table, layout)
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
         # In files with this layout the robot only drives away from the start of each run, so the
@@ -256,6 +263,8 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
             notes.append(
                 f"column '{columns[j]}' has empty cells: it is used at the times of its values"
             )
+        if name == "wheel_ticks":
+            cells = cumulative_ticks(cells, layout, notes)
         values = (cells * channel.scale + channel.offset) * layout.to_si(name)
         signal, there = Signal(time, values, source), ~missing.all(axis=1)
         out[name] = signal if there.all() else signal.part(there)
@@ -270,4 +279,6 @@ def _time(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
         return np.arange(len(table.values)) * float(layout.row_period or 1.0)
     channel = layout.channels["time"]
     cells = table.stacked(channel)
+    if cells.shape[1] == 2:
+        cells = cells[:, :1] + 1e-9 * cells[:, 1:]
     return ((cells * channel.scale + channel.offset) * layout.to_si("time"))[:, 0]

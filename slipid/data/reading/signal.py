@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.data.align.clock import Clock
+from slipid.data.reading.layout import SensorLayout
 from slipid.support.errors import DataError, bad_data
 
 
@@ -110,6 +111,29 @@ def clock_of(signals: Sequence[Signal]) -> Float[np.ndarray, " time"]:
 def first_true(mask: Bool[np.ndarray, " _"]) -> int | None:
     """Return the index of the first True, or None if there is none."""
     return int(np.argmax(mask)) if mask.any() else None
+
+
+def cumulative_ticks(
+    ticks: Float[np.ndarray, "row column"], layout: SensorLayout, notes: list[str]
+) -> Float[np.ndarray, "row column"]:
+    """Return the cumulative ticks of each wheel; cells that are NaN stay so.
+
+    Increments are summed; the wrap-around of a counter of `tick_bits` bits is removed, with a note.
+    The ticks must be those that the counter showed, since interpolated ones do not tell where it
+    wrapped around.
+    """
+    period = 2.0**layout.tick_bits
+    out = ticks.copy()
+    for k, column in enumerate(ticks.T):
+        there = ~np.isnan(column)
+        counts = column[there]
+        if layout.ticks_are_increments:
+            out[there, k] = np.cumsum(counts)
+        elif np.abs(steps := np.diff(counts)).max(initial=0.0) > 0.5 * period:
+            out[there, k] -= period * np.concatenate([[0.0], np.cumsum(np.round(steps / period))])
+            note = f"the wrap-around of the tick counter at {layout.tick_bits} bits was removed"
+            notes += [] if note in notes else [note]
+    return out
 
 
 def heading(turned: Signal) -> Signal:

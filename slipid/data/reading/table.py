@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +20,7 @@ from slipid.support.errors import bad_data, first_names
 if TYPE_CHECKING:
     from pyarrow import Table as ParquetTable
 
+_DATE = re.compile(r"\d{4}[-/]\d{2}[-/]\d{2}[T ]\d{2}:")
 MISSING = {"", "nan", "na", "n/a", "null", "none"}
 """Contents of cells, in lower case, that mean a missing number."""
 
@@ -84,6 +86,7 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     check_fields(path, body, header, layout)
     if layout.units_row:
         check_units(path, text[layout.units_row - 1], header, layout)
+    check_dates(path, body[0], header, layout)
     where = [header.index(name) for name in names]
     values, wrong = cell_numbers(body, layout.delimiter, where)
     for i, j in np.argwhere(wrong)[:1].tolist():
@@ -140,7 +143,8 @@ def parquet_numbers(
 ) -> tuple[list[str], Float[np.ndarray, "row column"], frozenset[int]]:
     """Return the names and numbers of a Parquet file, and the positions of columns of other types.
 
-    A column of another type, such as strings, has NaN for its numbers.
+    Dates and durations become seconds, dates since 1970 in UTC. A column of another type, such as
+    strings, has NaN for its numbers.
     """
     import pyarrow
 
@@ -148,6 +152,11 @@ def parquet_numbers(
     values, texts = np.full((table.num_rows, table.num_columns), np.nan), set()
     for k, column in enumerate(table.columns):
         try:
+            if pyarrow.types.is_timestamp(column.type) or pyarrow.types.is_duration(column.type):
+                per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[column.type.unit]
+                whole, part = np.divmod(column.cast(pyarrow.int64()).to_numpy(), per_second)
+                values[:, k] = whole + part / per_second
+                continue
             values[:, k] = column.cast(pyarrow.float64()).to_numpy()
         except pyarrow.ArrowException:
             texts.add(k)
@@ -183,12 +192,35 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 
 
 def number_in(cell: str) -> float | None:
-    """Return the number in a cell, or None if the cell is not a number."""
+    """Return the number in a cell, or None if the cell is not a number.
+
+    A date with a time of day (ISO 8601, also as pandas writes it) is the number of seconds since
+    1970, in UTC if it names no zone.
+    """
     try:
         # Python would accept 1_000 as a number, which is surely a damaged cell.
         return float(cell) if "_" not in cell else None
     except ValueError:
+        return _seconds_since_1970(cell)
+
+
+def _seconds_since_1970(cell: str) -> float | None:
+    """Return the seconds since 1970 of a date with a time of day, or None for other text."""
+    if not _DATE.match(cell):
         return None
+    try:
+        date = datetime.fromisoformat(cell.replace("/", "-"))
+    except ValueError:
+        return None
+    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+
+
+def _number(cell: str) -> float:
+    """Return the number in a cell with a date, for `numpy.loadtxt`; raise `ValueError` if none."""
+    number = number_in(cell.strip().strip("\"'"))
+    if number is None:
+        raise ValueError(cell)
+    return number
 
 
 def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
@@ -280,6 +312,19 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
                 raise bad_data(path, found, expected, row=row, column=str(column))
 
 
+def check_dates(path: Path, line: str, header: list[str], layout: Layout) -> None:
+    """Raise `DataError` if a time in the first row is a date, and its declared unit is not s."""
+    cells, time = cells_of(line, layout.delimiter), layout.channels.get("time")
+    if time is None or same_unit(time.unit, "s"):
+        return
+    for column in time.columns:
+        at = header.index(str(column))
+        if at < len(cells) and _seconds_since_1970(cells[at]) is not None:
+            found = f"the date '{cells[at]}' in a column with the unit '{time.unit}'"
+            expected = "unit = 's' for the channel time: dates become seconds since 1970"
+            raise bad_data(path, found, expected, row=layout.first_data_row, column=str(column))
+
+
 def cell_numbers(
     body: Sequence[str], delimiter: str, where: Sequence[int]
 ) -> tuple[Float[np.ndarray, "row column"], Bool[np.ndarray, "row column"]]:
@@ -293,8 +338,17 @@ def cell_numbers(
         where: positions of the columns.
     """
     wrong = np.zeros((len(body), len(where)), dtype=bool)
+    first = enumerate(cells_of(body[0], delimiter)) if body else ()
+    dates = [at for at, cell in first if at in where and _DATE.match(cell)]
     try:
-        values = np.loadtxt(body, delimiter=delimiter, usecols=where, ndmin=2, comments=None)
+        values = np.loadtxt(
+            body,
+            delimiter=delimiter,
+            usecols=where,
+            ndmin=2,
+            comments=None,
+            converters=dict.fromkeys(dates, _number),
+        )
         return values, wrong[: len(values)]
     except ValueError:
         values = np.full(wrong.shape, np.nan)

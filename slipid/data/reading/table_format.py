@@ -154,12 +154,19 @@ def _delimiter_of(lines: list[str]) -> str:
 
 
 def _first_numbers(rows: list[list[str]]) -> int | None:
-    """Return the index of the first row with mostly numbers, or None if there is none."""
+    """Return the index of the first row with numbers, or None if there is none.
+
+    Most of its cells are numbers, or those that are numbers in most rows: other columns may have
+    text.
+    """
     usual = Counter(len(row) for row in rows).most_common(1)[0][0]
-    for k, row in enumerate(rows):
-        filled = [cell for cell in row if cell.lower() not in MISSING]
-        numbers = sum(number_in(cell) is not None for cell in filled)
-        if len(row) >= usual - 1 and numbers > 0.5 * len(filled):
+    are = [tuple(number_in(cell) is not None for cell in row) for row in rows]
+    often, times = Counter(are).most_common(1)[0]
+    columns = [at for at, number in enumerate(often) if number and times > 0.5 * len(rows)]
+    for k, (row, numbers) in enumerate(zip(rows, are, strict=True)):
+        filled = sum(cell.lower() not in MISSING for cell in row)
+        known = len(columns) > 1 and len(row) == len(often) and all(numbers[at] for at in columns)
+        if len(row) >= usual - 1 and (sum(numbers) > 0.5 * filled or known):
             return k
     return None
 

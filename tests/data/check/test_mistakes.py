@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from functools import cache
-from math import pi
+from math import pi, tau
 
+import numpy as np
 import pytest
 
 from slipid.data.check.ratios import ScaleRatio, single_causes
 from slipid.data.check.sanity import findings
+from slipid.data.log import WheelReading
+from slipid.data.runs import collect
 from tests.helpers.mistakes import MISTAKES
-from tests.helpers.plain_robot import DRIVES, Drive, as_runs, drive
+from tests.helpers.plain_robot import DRIVES, GEAR, Drive, as_runs, drive
 
 MASS_KG = 12.0
 ONLY_POSES = ("speed", "command", "twist", "current", "voltage", "gyro")
@@ -114,6 +119,62 @@ def test_two_mistakes_are_both_named():
     assert {f.kind for f in alarms(as_runs(raws), omni.geometry)} == {"wheel_sign", "heading_sign"}
 
 
+def read_from(raws, **reading):
+    """The runs as a reader would give them from a channel of the layout."""
+    logs = as_runs(raws).logs
+    return collect([replace(log, wheel_reading=WheelReading(**reading)) for log in logs])
+
+
+def test_ticks_declared_as_radians_are_named_beside_the_wrong_unit_of_speed():
+    (omni, *_) = DRIVES
+    raws = [
+        replace(
+            raw.less("command", "twist"), angle=np.round(320 * raw.angle), speed=tau * raw.speed
+        )
+        for raw in driven(omni)
+    ]
+    ticks, speed = alarms(
+        read_from(raws, channel="wheel_angle", gear_ratio=5.0, whole=True), omni.geometry
+    )
+    assert (ticks.kind, speed.kind) == ("wheel_ticks", "wheel_speed_unit")
+    (per_rad,) = re.findall(r"like ticks \(about (\d+) per rad of wheel\)", ticks.found)
+    (per_turn,) = re.findall(r"\(about (\d+) with the layout's gear_ratio = 5\)", ticks.remedy)
+    assert float(per_rad) == pytest.approx(320, rel=0.01)
+    assert float(per_turn) == pytest.approx(tau * 320 / 5, rel=0.01)
+    assert "6.28 times too large" in speed.found
+
+
+def test_whole_angles_are_asked_about_if_nothing_tells_their_unit():
+    (omni, *_) = DRIVES
+    raws = [
+        replace(raw.less(*ONLY_POSES), angle=np.round(320 * raw.angle), pose=0 * raw.pose)
+        for raw in driven(omni)
+    ]
+    found = alarms(read_from(raws, channel="wheel_angle", whole=True), omni.geometry)
+    assert [f.severity for f in found if f.kind == "wheel_ticks"] == ["suspicious"]
+
+
+@pytest.mark.parametrize(
+    ("channel", "layout_gear", "advice"),
+    [
+        ("wheel_ticks", 1.0, "set gear_ratio = 16 in the layout"),
+        ("wheel_ticks", GEAR, "multiply ticks_per_revolution"),
+        ("motor_angle", GEAR, "multiply the layout's gear_ratio by"),
+        ("wheel_angle", GEAR, "channel motor_angle instead of wheel_angle, with gear_ratio = 16"),
+    ],
+)
+def test_a_gear_ratio_that_the_layout_has_is_not_advised(channel, layout_gear, advice):
+    (omni, *_) = DRIVES
+    raws = [
+        replace(raw, angle=raw.angle * GEAR, speed=raw.speed * GEAR, command=raw.command)
+        for raw in driven(omni)
+    ]
+    found = alarms(read_from(raws, channel=channel, gear_ratio=layout_gear), omni.geometry)
+    remedies = " ".join(f.remedy for f in found)
+    assert advice in remedies
+    assert ("set gear_ratio = 16 in the layout" in remedies) == (layout_gear == 1.0)
+
+
 def test_a_turned_marker_hides_no_other_unit_of_the_pose():
     """Path lengths of body and wheels are compared in the corrected axes of the heading."""
     (omni, *_) = DRIVES
@@ -135,6 +196,6 @@ def test_a_heading_in_another_unit_makes_a_gyro_look_too_small():
         "turning": ScaleRatio(0.8 * deg, 0.35, 0.8, 1.35),
         "gyro": ScaleRatio(1 / deg, 0.75, 1.0, 1.33),
     }
-    found, alone = single_causes(ratios, False, 0.05, 16.0)
+    found, alone = single_causes(ratios, False, 0.05, 16.0, WheelReading())
     assert alone
     assert [(e.name, e.factor) for e in found] == [("heading", pytest.approx(deg))]

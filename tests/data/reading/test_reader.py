@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from slipid.data.log import WheelReading
 from slipid.data.reading.layout import PER_WHEEL
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import find_logs
@@ -317,6 +318,18 @@ def test_angles_may_come_from_speeds_or_as_such(root):
     turns = {"motor_angle": {"columns": ["left", "right"], "unit": "rev", "scale": 1 / 500}}
     angles = generic(root, columns={"wheel_ticks": False, **turns})
     np.testing.assert_allclose(angles.wheel_angle, ticks.wheel_angle, atol=1e-9)
+
+
+def test_whole_angles_are_marked_as_perhaps_ticks(root):
+    def read(unit, scale=1.0):
+        turns = {"columns": ["left", "right"], "unit": unit, "scale": scale}
+        columns = {"wheel_ticks": False, "motor_angle": turns}
+        return generic(root, columns=columns).wheel_reading
+
+    assert read("rad") == WheelReading("motor_angle", 10.0, whole=True)
+    assert not read("deg").whole  # of one degree an encoder may be
+    assert not read("rad", 0.01).whole
+    assert not generic(root).wheel_reading.whole  # ticks are whole as they should be
 
 
 def test_all_columns_of_a_table(root):

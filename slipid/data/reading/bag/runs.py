@@ -143,8 +143,6 @@ def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray
     time, values = signals[name].time, signals[name].values * per_wheel(name, layout)
     if name.endswith("_speed"):
         return time[(np.abs(values) > LEAST_MOTION).any(axis=1)]
-    if name == "wheel_ticks" and layout.ticks_are_increments:
-        values = np.cumsum(values, axis=0)
     moved = {row for column in values.T for row in _moved(column)}
     return time[sorted(moved)]
 

@@ -15,7 +15,7 @@ from slipid.data.reading.bag.plan import ChannelPlan
 from slipid.data.reading.bag.streams import Edge, JointPick, Stream, TransformPick
 from slipid.data.reading.bag.transforms import STATIC, TransformSeries, composed, heading, tilt
 from slipid.data.reading.layout import CHANNELS, GROUPS, PER_WHEEL
-from slipid.data.reading.signal import Signal, SignalSource, first_true
+from slipid.data.reading.signal import Signal, SignalSource, cumulative_ticks, first_true
 from slipid.data.reading.units import factor
 from slipid.support.errors import bad_data, did_you_mean, first_names
 
@@ -153,10 +153,12 @@ def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) 
     source = SignalSource(first.source.path, names, lines, topics)
     if not len(time):
         raise source.error("its columns share no time", "columns that were recorded together")
+    # The columns of plain numbers are all called `data`: then the names of the topics differ.
+    called = names if len(set(names)) > 1 else tuple(stream.topic.name for stream, _ in pairs)
     gap = max(float(np.diff(one.time).max(initial=0.0)) for one in signals)
     notes.append(
-        f"topics {topics}: {', '.join(names[1:])} were sampled at other times than {names[0]} and "
-        f"were interpolated to its times (longest gap {gap:.3g} s)"
+        f"topics {topics}: {', '.join(called[1:])} were sampled at other times than {called[0]} "
+        f"and were interpolated to its times (longest gap {gap:.3g} s)"
     )
     columns = zip(signals, pairs, strict=True)
     values = [np.interp(time, one.time, one.values[:, j]) for one, (_, j) in columns]
@@ -217,6 +219,8 @@ def channel_signal(
     else:
         streams = [checked_stream(stream) for stream in streams]
     streams = [cleaned(stream, layout, notes) for stream in streams]
+    if plan.channel == "wheel_ticks":
+        streams = [_counted(stream, layout, notes) for stream in streams]
     if len(streams) == 1 and mostly_whole(streams[0]):
         samples = whole_signal(streams[0], notes)
     else:
@@ -231,6 +235,12 @@ def channel_signal(
         raise samples.source.error(found, "one number; select it by its index, such as [0]")
     values = (samples.values * scale + plan.spec.offset) * factor(plan.unit, CHANNELS[plan.channel])
     return Signal(samples.time, values, samples.source)
+
+
+def _counted(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
+    """Return a stream of tick counters with their cumulative ticks."""
+    counts = np.where(stream.absent, np.nan, stream.values)
+    return replace(stream, values=np.nan_to_num(cumulative_ticks(counts, layout, notes)))
 
 
 def checked_stream(stream: Stream) -> Stream:

@@ -102,6 +102,27 @@ def test_plain_arrays_and_numbers(tmp_path):
     np.testing.assert_allclose(run.signals["bus_voltage"].values[:, 0], 0.1 * k)
 
 
+def test_counters_of_several_topics_are_continued_before_they_are_joined(tmp_path):
+    counts = [np.round(900.0 * sign * (TIME - TIME[0])) * 30.0 for sign in (1.0, -1.0)]
+    shown = [(count + 2**15) % 2**16 - 2**15 for count in counts]
+    messages = [
+        [
+            Message(topic, "std_msgs/msg/Int16", {"data": int(ticks)}, t + late)
+            for ticks, t in zip(column, TIME.tolist(), strict=True)
+        ]
+        for topic, column, late in (("/left", shown[0], 0.0), ("/right", shown[1], 0.004))
+    ]
+    topics = {"wheel_ticks": {"topics": ["/left", "/right"], "unit": "tick", "scale": [1.0, -1.0]}}
+    path = bag(tmp_path, "mcap", *messages)
+    run = read(path, topics=topics, ticks_per_revolution=1000.0, tick_bits=16)
+    ticks = run.signals["wheel_ticks"].values
+    np.testing.assert_array_equal(ticks[:, 0], counts[0][1:])
+    right = np.interp(TIME[1:], TIME + 0.004, -counts[1])
+    np.testing.assert_allclose(ticks[:, 1], right, atol=0.01)
+    assert "the wrap-around of the tick counter at 16 bits was removed" in run.notes
+    assert any("/right were sampled at other times than /left" in note for note in run.notes)
+
+
 def test_a_pose_inside_a_message_of_ones_own(tmp_path):
     text = {"my_msgs/msg/Seen": "std_msgs/Header header\ngeometry_msgs/Pose robot\nfloat32 x\n"}
     messages = [

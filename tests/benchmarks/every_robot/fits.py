@@ -1,0 +1,110 @@
+"""What slipid makes of a robot's logs: `slipid identify`, and `slipid validate` on fresh runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.benchmarks.every_robot.drive import Judged
+from tests.benchmarks.every_robot.robots import MadeRobot
+from tests.benchmarks.every_robot.score import numbers, true
+from tests.helpers.shared import invoke
+
+Rows = dict[str, dict[str, float]]
+"""Mean error over the fresh runs [% of the path], keyed by model and floor."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What slipid says of a robot.
+
+    Attributes:
+        verdict: verdict of trust, or why there is none.
+        rows: errors, keyed by slip model.
+        inside: whether the 90 % interval of each number holds the true one.
+        selected: slip model that slipid selects on each floor.
+    """
+
+    verdict: str
+    rows: Rows = field(default_factory=dict)
+    inside: dict[str, bool] = field(default_factory=dict)
+    selected: dict[str, str] = field(default_factory=dict)
+
+
+def answer(robot: MadeRobot, folder: Path, truth: dict[str, Judged]) -> Answer:
+    """Fit the logs of a folder and predict its fresh runs, as a user would on the command line."""
+    if not robot.readable:
+        return Answer("config not readable yet")
+    config, out = folder / "robot.toml", folder / "out"
+    done = invoke("identify", config, "--data", folder / "logs", "--out", out, "--quiet")
+    if done.exit_code not in (0, 1) or not (out / "identified.json").exists():
+        return Answer(f"refused: {done.stderr.strip().replace(str(folder), '')}")
+    content = json.loads((out / "identified.json").read_text(encoding="utf-8"))
+    run = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    verdict = (content.get("trust") or run["trust"])["verdict"]
+    inside = covered_motors(robot, content["parameters"])
+    if "calibration" in content:
+        inside |= covered(robot, content["calibration"])
+    selected = content.get("selected_model", {})
+    file = out / "validation.json"
+    done = invoke("validate", out, "--data", folder / "fresh", "--json", file, "--quiet")
+    if done.exit_code != 0:
+        return Answer(f"{verdict}; not validated: {done.stderr.strip()}", {}, inside, selected)
+    runs = json.loads(file.read_text(encoding="utf-8"))["runs"]
+    return Answer(verdict, _rows(runs, truth), inside, selected)
+
+
+def _rows(runs: Iterable[dict], truth: dict[str, Judged]) -> Rows:
+    """Errors of every model over the true path lengths, by which the rivals are judged, too."""
+    errors: dict[str, dict[str, list[float]]] = {}
+    for run in runs:
+        path = next(j.path for name, j in truth.items() if run["name"].endswith(name))
+        for model, score in run["models"].items():
+            error = 100 * run["chord"] * score["endpoint_error"] / path
+            name = "contact" if model == "identified" and "contact" not in run["models"] else model
+            errors.setdefault(name, {}).setdefault(run["surface"], []).append(error)
+    return {
+        model: {floor: sum(each) / len(each) for floor, each in floors.items()}
+        for model, floors in errors.items()
+    }
+
+
+def covered(robot: MadeRobot, calibration: dict) -> dict[str, bool]:
+    """Whether the intervals of `calibration` in identified.json hold the true numbers."""
+    stated = {"lag": calibration["pose_lag_s"]}
+    stated |= dict(zip(("place x", "place y"), calibration["pose_offset_m"], strict=True))
+    for floor, centre in calibration.get("centre_of_rotation_m", {}).items():
+        stated[f"centre {floor}"] = centre
+    for floor, of in calibration["surfaces"].items():
+        for j, radius in enumerate(of["rolling_radius_m"]):
+            stated[f"radius {floor} {j + 1}"] = radius
+        for key in {"effective_track_m", "effective_base_m"} & of.keys():
+            stated[f"base {floor}"] = of[key]
+    if "steering" in calibration:
+        for floor in robot.floors:
+            stated[f"base {floor.name}"] = calibration["steering"]["wheelbase_m"]
+    truth, found = true(robot), {}
+    for name, number in numbers(robot).items():
+        if stated.get(name, {}).get("interval90") is not None:
+            low, high = stated[name]["interval90"]
+            found[name] = bool(low <= number(truth) <= high)
+    return found
+
+
+def covered_motors(robot: MadeRobot, parameters: dict) -> dict[str, bool]:
+    """Whether the intervals of the motors' numbers in identified.json hold the true ones."""
+    if robot.motors is None:
+        return {}
+    right = {
+        "motor.resistance": robot.motors.resistance,
+        "motor.back_emf": robot.motors.back_emf,
+        "motor.coulomb_friction": robot.motors.coulomb,
+        "motor.viscous_friction": robot.motors.viscous,
+    }
+    found = {}
+    for path, value in right.items():
+        low, high = parameters[path]["interval90"]
+        found[path] = bool(low <= value <= high)
+    return found
