@@ -3,9 +3,9 @@
     make bench
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_every_robot.py
 
-(about a minute for a robot and a seed, eight seeds each; `-k omni` for some robots, `-n 2
---dist loadfile` is of no use: seeds of one robot share what is compiled). What is finished is kept
-in out/bench_every_robot, so that an interrupted run goes on.
+(about a minute for a robot and a seed, eight seeds each; `-k omni` for some robots,
+SLIPID_BENCH_SEEDS=1 for fewer seeds). What is finished is kept in out/bench_every_robot, so that an
+interrupted run goes on.
 
 Robots, their logs and the rivals share nothing with slipid (tests/benchmarks/every_robot). Every
 row is open loop from the first pose of fresh runs with other paths and speeds: the distance of the
@@ -13,7 +13,7 @@ predicted end from the measured one, over the path length, mean over runs and se
 
 - nominal: the numbers of the config;
 - squares: robust least squares with scipy on radii, track or base, lever arm and lag;
-- floor: the true numbers, so what noise of wheels and poses leaves;
+- floor: the true numbers, so that the noise of wheels and poses is all that is left;
 - calibrated, contact, selected: slipid's slip models, as far as `slipid validate` knows them.
 
 Asserts that least squares reaches the noise floor where kinematics are all there is, and that

@@ -44,6 +44,7 @@ def windows(shape, seed=0, runs=24, count=4):
         dt=np.full((runs, count), 0.5),
         turn=0.5 * turn,
         speed_change=rng.normal(size=turn.shape),
+        direction=np.tanh(turn / 0.2),
         pose=np.zeros((runs, count + 1, 3)),
         current=zero,
         voltage=zero,

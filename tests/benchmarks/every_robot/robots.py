@@ -227,6 +227,7 @@ ROBOTS = (
         rest=1.0,
         motors=MOTORS,
         noise_rad=0.001,
+        wheel_noise=0.003,
     ),
     MadeRobot(
         "diff_coarse_ticks",
