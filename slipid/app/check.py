@@ -65,7 +65,9 @@ def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
     logged = [n for n in ("current", "voltage") if getattr(task.dataset, n) is not None]
     robot = task.config.content.wheels
     absent = ["mass_kg"] if robot.mass_kg is None else []
-    absent += [] if "gear_ratio" in robot.model_fields_set else ["gear_ratio"]
+    torques = task.dataset.current_is_torque  # which are those of the wheels
+    absent += [] if torques or "gear_ratio" in robot.model_fields_set else ["gear_ratio"]
+    logged = ["torque"] if torques else logged
     if not logged or not absent:
         return
     taken = {"mass_kg": f"{float(task.robot.body.mass):g} kg", "gear_ratio": "1"}
