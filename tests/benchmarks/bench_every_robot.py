@@ -91,7 +91,7 @@ def test_robot(robot: MadeRobot, tmp_path: Path) -> None:
     print(f"\n{HEAD}\n{line(records)}")
     rows = mean_rows(records)
     if robot.determined:
-        assert rows["squares"] < quick(1.5, 3.0) * rows["floor"] + 0.1
+        assert rows["squares"] < (1.5 if SEEDS >= 8 else 3.0) * rows["floor"] + 0.1
     assert rows["floor"] < min(rows["squares"], rows["nominal"]) + 0.3
 
 

@@ -15,7 +15,7 @@ from slipid.data.reading.bag.topics import Topic, topics_of
 from slipid.data.reading.column_names import meaning_of
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, TURNS, Layout
 
-SUFFIXES = (".bag", ".db3", ".mcap")
+SUFFIXES = (".bag", ".db3", ".mcap", ".ulg")
 _METADATA = "metadata.yaml"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -161,7 +161,7 @@ def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel
             if channel in taken or not topic.count:
                 continue
             taken.add(channel)
-            count = max((f.count for f in topic.fields if f.type.endswith("[]")), default=1)
+            count = max((f.count for f in topic.fields if f.type.endswith("]")), default=1)
             wheels = joints if topic.joints else count if channel in PER_WHEEL else 0
             yield _TopicChannel(channel, topic, wheels, _pose_question(channel, topic))
         if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
