@@ -185,7 +185,7 @@ def test_a_skid_that_turns_on_the_spot_needs_a_wider_track_than_it_has():
 
 
 def test_a_skid_of_equal_halves_turns_about_its_middle_on_a_soft_floor():
-    """Friction that resisted accelerations, as the engine can, would push it outwards in a curve."""
+    """Friction that resisted accelerations would push it outwards in a curve."""
     run = straight("soft", "as_built", 0.0, 0.4, 0.6, 0.4)
     trace = driven(run, SKID)
     found = effective_kinematics(SKID, [(run, trace.pose[::10], trace.wheel_angle[::10])])
