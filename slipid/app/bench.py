@@ -103,7 +103,11 @@ def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
 
 
 def read_motor_log(
-    path: Path, given: Mapping[str, GivenColumns], delimiter: str | None, signed: bool
+    path: Path,
+    given: Mapping[str, GivenColumns],
+    delimiter: str | None,
+    signed: bool,
+    pole_pairs: float | None = None,
 ) -> BenchTask:
     """Return the task of motors in a single log file.
 
@@ -113,11 +117,12 @@ def read_motor_log(
             column names.
         delimiter: character between cells, or None to guess it.
         signed: True if currents have a sign.
+        pole_pairs: pole pairs of the motor if the speed is electrical, else None.
 
     Raises:
         DataError: the file cannot be read, or lacks a channel.
     """
-    layout = motor_layout(format_of(path, delimiter), given, signed)
+    layout = motor_layout(format_of(path, delimiter), given, signed, pole_pairs)
     logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
     refuse_misordered(logs)
     records = _by_motor([records_of(log, layout) for log in logs], (), path)

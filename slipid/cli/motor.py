@@ -31,6 +31,10 @@ def motor(
         Column, _column("Column with the duty cycle, 0 to 1, instead of the voltage; in %, as d:%.")
     ] = None,
     bus: Annotated[Column, _column("Column with the bus voltage, in V; with --duty.")] = None,
+    pole_pairs: Annotated[
+        float | None,
+        option("NUMBER", "Pole pairs of the motor, if the speed is electrical (erpm).", min=1),
+    ] = None,
     unsigned: Annotated[
         bool, flag("--unsigned", "The logged current is a magnitude without sign.")
     ] = False,
@@ -66,7 +70,7 @@ def motor(
     given = {c: given_columns(text, c) for c, text in columns.items() if text is not None}
     with Reporter(quiet=quiet) as report:
         report.stage("reading the log")
-        task = read_motor_log(file, given, delimiter, not unsigned)
+        task = read_motor_log(file, given, delimiter, not unsigned, pole_pairs)
         fit = task.fit(report)
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:

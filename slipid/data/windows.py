@@ -14,6 +14,12 @@ NORMAL_STD = 0.6827
 UNREAD_VARIANCE = 1e6
 """Variance assigned to the mean of a window without any reading [A^2] or [V^2]; it is large enough
 that the mean has practically no weight."""
+FRICTION_SPEED = 0.2
+"""Wheel speed over which the friction of a motor changes its sign, as in `slipid.model.motor`
+[rad/s]."""
+SPEED_S = 0.16
+"""Time over which the speed of a wheel is averaged [s]; shorter means would show the uneven updates
+of the encoder."""
 PerWindow = Float[np.ndarray, "window wheel"]
 
 
@@ -30,6 +36,10 @@ class Windows:
             by `lag`.
         speed_change: wheel speed at the window's end less that at its start [rad/s], so that
             d turn / d lag = -speed_change.
+        direction: sign of the motion of each wheel, averaged over the window: the mean of
+            tanh(w / w0) with the wheel speed w and w0 = `FRICTION_SPEED`. It is 0 for a wheel at
+            rest, and 0.5 for one that turns forward during half of the window. If `current` is a
+            mean of magnitudes, it is the mean of |tanh(w / w0)| with the sign of `turn`.
         pose: pose at the edges of the windows (segment, window + 1, 3), as logged.
         current: mean of the signed current or of its magnitude [A]; zeros if not logged.
         voltage: mean voltage [V]; zeros if not logged.
@@ -51,6 +61,7 @@ class Windows:
     dt: Float[np.ndarray, "segment window"]
     turn: Float[np.ndarray, "segment window wheel"]
     speed_change: Float[np.ndarray, "segment window wheel"]
+    direction: Float[np.ndarray, "segment window wheel"]
     pose: Float[np.ndarray, "segment edge 3"]
     current: Float[np.ndarray, "segment window wheel"]
     voltage: Float[np.ndarray, "segment window wheel"]
@@ -203,8 +214,7 @@ def _cut(
     rows = data.rows(run)
     t, angle = data.time[rows], data.wheel_angle[rows]
     at = t[edges] - lag
-    # Speeds are means over 0.16 s: shorter means would show the encoder's uneven updates.
-    half = 0.08
+    half = SPEED_S / 2
     turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))
     span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
     speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
@@ -226,17 +236,67 @@ def _cut(
 
     mean_current, current_var = meter(amps, data.current_fresh, noise)
     mean_voltage, voltage_var = meter(volts, data.voltage_fresh, 0.0)
+    turn = np.diff(turned, axis=0)
+    direction = _direction(t, angle, data.live[rows], at, data.current_is_signed)
     return {
         "start": np.asarray(t[edges[0]]),
         "dt": np.diff(t[edges]),
-        "turn": np.diff(turned, axis=0),
+        "turn": turn,
         "speed_change": np.diff(speed, axis=0),
+        "direction": direction if data.current_is_signed else direction * np.sign(turn),
         "pose": data.pose[rows][edges],
         "current": mean_current,
         "voltage": mean_voltage,
         "current_var": current_var,
         "voltage_var": voltage_var,
     }
+
+
+def _direction(
+    time: Float[np.ndarray, " row"],
+    angle: Float[np.ndarray, "row wheel"],
+    live: Bool[np.ndarray, " row"],
+    at: Float[np.ndarray, " edge"],
+    signed: bool,
+) -> PerWindow:
+    """Return the sign of the motion of each wheel, averaged over each window.
+
+    The result is sum_k p_k tanh(w_k / w0) over forward and backward motion k, where p_k is the
+    share of the time in this motion, w_k the mean speed in it, and w0 = `FRICTION_SPEED`; a mean of
+    the tanh of every row's speed would be too small at low speeds, because rows show the steps of
+    the encoder. In a row a wheel moves if it turns in the same direction just before and just after
+    the row. Arguments as in `_mean`; if not `signed`, the result is the sum of the magnitudes.
+    """
+    before, after = _speeds(time, angle)
+    total = np.zeros((len(at) - 1, angle.shape[1]))
+    for moves in (np.minimum(before, after) > 0, np.maximum(before, after) < 0):
+        share, _, _ = _mean(time, moves.astype(float), live, None, at)
+        speed, _, _ = _mean(time, moves * 0.5 * (before + after), live, None, at)
+        part = share * np.tanh(speed / np.maximum(share, 1e-9) / FRICTION_SPEED)
+        total += part if signed else np.abs(part)
+    return total
+
+
+def _speeds(
+    time: Float[np.ndarray, " row"], angle: Float[np.ndarray, "row wheel"]
+) -> tuple[Float[np.ndarray, "row wheel"], Float[np.ndarray, "row wheel"]]:
+    """Return the mean wheel speeds just before and just after every row [rad/s].
+
+    The means are over `SPEED_S`, or over the time in which a wheel at `FRICTION_SPEED` turns by the
+    smallest step between readings of its encoder, if this is longer. Near the ends of a run, where
+    only one of the means is known, it stands for both.
+    """
+    before, after = np.empty_like(angle), np.empty_like(angle)
+    for k, column in enumerate(angle.T):
+        step = np.abs(np.diff(column))
+        finest = float(np.min(step, where=step > 1e-9, initial=np.inf))
+        length = finest / FRICTION_SPEED if np.isfinite(finest) else 0.0
+        length = min(max(SPEED_S, length), 0.5 * float(time[-1] - time[0]))
+        ahead, behind = (np.interp(time + s, time, column) for s in (length, -length))
+        after[:, k], before[:, k] = (ahead - column) / length, (column - behind) / length
+        last, first = time + length > time[-1], time - length < time[0]
+        after[last, k], before[first, k] = before[last, k], after[first, k]
+    return before, after
 
 
 def _mean(

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from slipid.data.windows import Windows
 from slipid.model import contact, se2
 from slipid.model.geometry import WheelFrame
+from slipid.model.motor import sign_of_motion
 from slipid.model.robot import GRAVITY, Robot
 
 Marker = Float[Array, "segment window 3"]
@@ -35,7 +36,10 @@ ROUNDING_VARIANCE = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 
 `motion` [m^2] or [rad^2], `current` [A^2], `voltage` [V^2]."""
 
-_AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "current_var", "lag")
+_AS_THEY_ARE = (
+    *("dt", "turn", "speed_change", "direction", "pose"),
+    *("current", "voltage", "current_var", "lag"),
+)
 
 
 def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
@@ -58,6 +62,7 @@ class Batch(eqx.Module):
     dt: Float[Array, "segment window"]
     turn: PerDrive
     speed_change: PerDrive
+    direction: PerDrive
     pose: Float[Array, "segment edge 3"]
     current: PerDrive
     voltage: PerDrive
@@ -219,7 +224,10 @@ def marker_increments(
 
 @eqx.filter_jit
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
-    """Return the predicted motor current of every window [A]; its magnitude for unsigned logs."""
+    """Return the predicted motor current of every window [A]; its magnitude for unsigned logs.
+
+    It is the mean over the window, in which wheels at rest have no friction and no traction.
+    """
     # `motor_force` is in units of mu m g with mu averaged over the wheels; `weight` is that unit.
     friction = robot.surfaces.friction[b.surface]
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
@@ -227,10 +235,23 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
     torque = (
         robot.geometry.wheel_radius * weight[..., None] * robot.motor.opposing_force(motor_force)
     )
-    amps = robot.motor.current(torque, wheel_speed(robot, b))
+    torque *= _share_of_motion(b)[..., None]
+    amps = robot.motor.current(torque, wheel_speed(robot, b), b.direction)
     if b.signed:
         return amps + robot.motor.current_offset
     return jnp.sqrt(amps**2 + SMOOTHING_A**2) + robot.motor.current_offset
+
+
+def _share_of_motion(b: Batch) -> Float[Array, "segment window"]:
+    """Return the factor from the forces at a window's mean wheel speeds to the mean forces [1].
+
+    The forces of the contact law hardly depend on the size of the wheel speeds, but on their
+    directions. The factor is the norm of the mean directions over the norm of the directions of the
+    mean speeds: 1 at steady speeds, otherwise about the share of the time in motion.
+    """
+    steady = sign_of_motion(b.turn / b.dt[..., None])
+    mean, of_mean = (jnp.sqrt(jnp.sum(x**2, axis=-1) + 1e-12) for x in (b.direction, steady))
+    return jnp.minimum(mean / of_mean, 1.0)
 
 
 @eqx.filter_jit
@@ -285,7 +306,7 @@ def _direction(b: Batch) -> PerDrive:
 
     The factor of an unsigned current passes smoothly from -1 to 1 around standstill.
     """
-    return jnp.ones_like(b.turn) if b.signed else jnp.tanh(b.turn / b.dt[..., None] / 0.2)
+    return jnp.ones_like(b.turn) if b.signed else sign_of_motion(b.turn / b.dt[..., None])
 
 
 def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:

@@ -98,7 +98,10 @@ def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Mul
     return MultiFloorRuns(whole, floor[at, 0], counts[at, 0] & original, names)
 
 
-_PER_WINDOW = ("dt", "turn", "speed_change", "current", "voltage", "current_var", "voltage_var")
+_PER_WINDOW = (
+    *("dt", "turn", "speed_change", "direction"),
+    *("current", "voltage", "current_var", "voltage_var"),
+)
 """Fields of `Windows` with one value per window."""
 
 

@@ -15,6 +15,8 @@ REST = 2.5
 
 It is about the resolution of the speed signal."""
 
+FRICTION_SPEED = 0.2
+"""Wheel speed over which friction changes its sign [rad/s]."""
 
 held = partial(electric, free=False)
 """Declaration of an electric parameter that is fixed unless the user frees it."""
@@ -63,12 +65,16 @@ class Motor(eqx.Module):
         drop = self.brush_drop * jnp.tanh(current / 0.05)
         return self.resistance * current + self.back_emf * wm + drop
 
-    def friction(self, wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
-        """Return the friction torque at the wheel [N m], with the sign of the wheel speed."""
-        return (
-            self.coulomb_friction * jnp.tanh(wheel_speed / 0.2)
-            + self.viscous_friction * wheel_speed
-        )
+    def friction(
+        self, wheel_speed: Float[Array, " *w"], direction: Float[Array, " *w"] | None = None
+    ) -> Float[Array, " *w"]:
+        """Return the friction torque at the wheel [N m], with the sign of the wheel speed.
+
+        If `wheel_speed` is a mean over some time, `direction` is the mean of `sign_of_motion` over
+        the same time [1], which differs from that of the mean speed where wheels rest or reverse.
+        """
+        along = sign_of_motion(wheel_speed) if direction is None else direction
+        return self.coulomb_friction * along + self.viscous_friction * wheel_speed
 
     def opposing_force(self, motor_force: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
         """Return the force that a motor works against: traction, plus drag in the drive direction.
@@ -90,10 +96,16 @@ class Motor(eqx.Module):
         return self.gain * current - self.friction(wheel_speed)
 
     def current(
-        self, torque: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
+        self,
+        torque: Float[Array, " *w"],
+        wheel_speed: Float[Array, " *w"],
+        direction: Float[Array, " *w"] | None = None,
     ) -> Float[Array, " *w"]:
-        """Return the signed current [A] for a wheel torque [N m], the inverse of `torque`."""
-        return (torque + self.friction(wheel_speed)) / self.gain
+        """Return the signed current [A] for a wheel torque [N m], the inverse of `torque`.
+
+        `direction` is as in `friction`.
+        """
+        return (torque + self.friction(wheel_speed, direction)) / self.gain
 
     def characteristic(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
@@ -107,6 +119,11 @@ class Motor(eqx.Module):
         """
         wm = self.gear_ratio * wheel_speed
         return self.back_emf * current + self.resistance * current**2 * wm / (wm**2 + REST**2)
+
+
+def sign_of_motion(wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
+    """Return the sign of a wheel speed, tanh(w / w0) with w0 = `FRICTION_SPEED`."""
+    return jnp.tanh(wheel_speed / FRICTION_SPEED)
 
 
 def signed(

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.model.motor import sign_of_motion
 from slipid.model.se2 import advance, compose
 from slipid.parameter import as_numbers
 from slipid.robot.closed_loop import PERIOD
@@ -239,7 +240,7 @@ class Twin(eqx.Module):
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
         # a motor at standstill draws no current, so the errors fade out there as well
-        moves = jnp.tanh(w / 0.2) ** 2
+        moves = sign_of_motion(w) ** 2
         model = f.standing(under).current(xi, w)
         free = (f.inverse @ (f.frame.radius * w))[:2]
         more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])

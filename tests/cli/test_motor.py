@@ -10,6 +10,7 @@ import pytest
 
 from slipid.app.bench_priors import bench_priors
 from slipid.app.config import parsed
+from slipid.data.reading.column_names import meaning_of
 from slipid.data.reading.motor_layout import given_columns, motor_layout
 from slipid.data.reading.table_format import format_of
 from slipid.support.errors import DataError
@@ -211,6 +212,60 @@ def test_columns_of_parquet_and_columns_without_names(tmp_path):
     path.write_text("1,2,3,4\n" * 12)
     with pytest.raises(DataError, match="no names for 4 columns; expected a line of column names"):
         motor_layout(format_of(path), {}, signed=True)
+
+
+VESC = (
+    "ms_today;input_voltage;temp_mos_max;temp_motor;current_motor;current_in;d_axis_current;"
+    "q_axis_current;erpm;duty_cycle;amp_hours_used;tachometer;encoder_position;fault_code;vesc_id;"
+    "d_axis_voltage;q_axis_voltage;"
+)
+
+
+@pytest.fixture
+def vesc(tmp_path):
+    """A log in the layout of VESC tool."""
+    path = tmp_path / "log.csv"
+    row = ";".join(str(k + 1.5) for k in range(VESC.count(";"))) + ";"
+    path.write_text("\n".join([VESC, *[row] * 12]))
+    return path
+
+
+def test_a_log_of_vesc_tool_is_known_by_its_names(vesc):
+    layout = motor_layout(format_of(vesc), {}, signed=True, pole_pairs=7.0)
+    assert {k: (*c.columns, c.unit, *c.scale) for k, c in layout.channels.items()} == {
+        "time": ("ms_today", "ms", 1.0),
+        "current": ("current_motor", "A", 1.0),
+        "motor_speed": ("erpm", "rpm", 1 / 7),
+        "duty": ("duty_cycle", "1", 1.0),
+        "bus_voltage": ("input_voltage", "V", 1.0),
+    }
+
+
+def test_an_electrical_speed_needs_the_pole_pairs(vesc):
+    for given in ((), ("--speed", "erpm:rpm")):
+        result = invoke("motor", vesc, *given, "--quiet")
+        assert result.exit_code == 2
+        assert "column 'erpm' has the electrical speed" in result.output
+        assert "expected --pole-pairs" in result.output
+
+
+@pytest.mark.parametrize("name", ["q_axis_voltage", "voltage_q", "Vd", "i_q", "d_current"])
+def test_the_axes_of_a_motor_are_no_motors(name):
+    assert meaning_of(name, of_motor=True).channel == ""
+
+
+def test_voltage_and_speed_alone_are_refused_with_the_reason(tmp_path):
+    path = tmp_path / "sysid.csv"
+    rows = [f"{0.02 * k},dynamic-forward,{0.1 * k},{k},{2 * k}" for k in range(12)]
+    names = "Timestamp (s),Test,Volts (V),Position (rot),Velocity (rot/s)"
+    path.write_text("\n".join([names, *rows]))
+    result = invoke("motor", path, "--quiet")
+    assert result.exit_code == 2
+    assert "voltage and speed alone tell kS, kV and kA" in result.output
+    assert "expected --current" in result.output
+    given = {"current": given_columns("Volts (V):A", "current")}
+    layout = motor_layout(format_of(path), given, signed=True)
+    assert layout.channels["motor_speed"].unit == "rot/s"
 
 
 @pytest.mark.slow

@@ -366,3 +366,54 @@ def test_a_run_with_too_few_frames_is_refused():
     data = collect([run(pose_fresh=None), run("blind.csv", pose_fresh=fresh)])
     with pytest.raises(DataError, match=r"blind\.csv: 4 poses .*; expected at least 5"):
         windows(data, RADIUS)
+
+
+# the direction of motion, which friction follows
+
+
+def swing(rate, seconds=8.0, tick=1e-4, **changes):
+    """Return a run whose wheels turn at rates that are a function of the time [rad/s]."""
+    one = run(seconds=seconds)
+    rates = np.broadcast_to(rate(one.time - one.time[0])[:, None], one.wheel_angle.shape)
+    angle = integral(one.time, rates)
+    return run(seconds=seconds, wheel_angle=np.round(angle / tick) * tick, **changes)
+
+
+def share(speed=3.0, tick=1e-4, **changes):
+    """Return the directions in a window that spans a stop, and the share of it before the stop."""
+    log = swing(lambda t: speed * (t < 4.0), tick=tick, **changes)
+    w = windows(collect([log]), RADIUS, per_segment=1, longest=60.0)
+    return w.direction[0, 0], (4.0 + log.time[0] - w.start[0]) / w.dt[0, 0]
+
+
+def test_direction_is_the_share_of_the_time_in_motion():
+    for speed in (3.0, -3.0, 20.0):
+        found, part = share(speed)
+        np.testing.assert_allclose(found, np.sign(speed) * part, atol=0.01)
+
+
+def test_direction_does_not_take_steps_of_a_coarse_encoder_for_rests():
+    found, part = share(1.0, tick=0.15)
+    np.testing.assert_allclose(found, part, atol=0.06)
+
+
+def test_direction_at_a_steady_speed_is_that_of_the_motor():
+    from slipid.model.motor import sign_of_motion
+
+    for speed in (0.1, -0.3, 2.0):
+        w = windows(collect([swing(lambda t, v=speed: np.full_like(t, v))]), RADIUS)
+        np.testing.assert_allclose(w.direction, float(sign_of_motion(speed)), atol=2e-3)
+
+
+def test_directions_of_a_reversal_cancel_in_signed_currents_alone():
+    for signed, expected in ((True, 0.0), (False, 1.0)):
+        log = swing(lambda t: np.where(t < 4.0, 3.0, -3.01), current_is_signed=signed)
+        w = windows(collect([log]), RADIUS, per_segment=1, longest=60.0)
+        np.testing.assert_allclose(np.abs(w.direction), expected, atol=0.08)
+
+
+def test_wheels_that_tremble_at_rest_do_not_move():
+    log = swing(lambda t: 3.0 * (t < 2.0))
+    noise = 1e-3 * np.random.default_rng(0).normal(size=log.wheel_angle.shape)
+    w = windows(collect([replace(log, wheel_angle=log.wheel_angle + noise)]), RADIUS)
+    assert (np.abs(w.direction[:, -1]) < 0.01).all()

@@ -68,6 +68,7 @@ def still(lag, runs, per_run):
         dt=np.full((runs, per_run), 0.25),
         turn=zero,
         speed_change=zero,
+        direction=zero,
         pose=np.zeros((runs, per_run + 1, 3)),
         current=zero,
         voltage=zero,
@@ -91,7 +92,8 @@ def crossed(truth_, runs, seed, offset=OFFSET):
     xi = np.stack([speed * np.cos(way), speed * np.sin(way), np.zeros(shape)], -1)
     rate = xi @ np.asarray(truth_.geometry.forward()).T / 0.04
     floor = rng.integers(2, size=(*shape, 3))
-    w = replace(still(truth_.camera.lag, runs, PER_RUN), turn=0.25 * rate)
+    w = still(truth_.camera.lag, runs, PER_RUN)
+    w = replace(w, turn=0.25 * rate, direction=np.tanh(rate / 0.2))
 
     @jax.jit
     def seen(b):

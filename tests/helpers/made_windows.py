@@ -61,6 +61,7 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
     rate = (xi @ np.asarray(truth.geometry.forward()).T / 0.04)[:, None, :]
     dt = rng.uniform(0.9, 1.1, (runs, count))
     labels, loads, sessions = truth.surfaces.labels, truth.body.loads, truth.camera.sessions
+    turn = dt[..., None] * rate * rng.normal(1.0, 0.02, (runs, count, 3))
     w = Windows(
         run=np.arange(runs),
         surface=tuple(labels[k % len(labels)] for k in range(runs)),
@@ -68,8 +69,9 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
         session=tuple(sessions[k // 3 % len(sessions)] for k in range(runs)),
         start=np.zeros(runs),
         dt=dt,
-        turn=dt[..., None] * rate * rng.normal(1.0, 0.02, (runs, count, 3)),
+        turn=turn,
         speed_change=rng.normal(0.0, 0.05, (runs, count, 3)),
+        direction=np.tanh(turn / dt[..., None] / 0.2),
         pose=rng.normal(0, 0.5, (runs, 1, 3)) * np.ones((count + 1, 1)),
         current=np.zeros((runs, count, 3)),
         voltage=np.zeros((runs, count, 3)),

@@ -32,9 +32,9 @@ class Rival:
             each, (self.b.surface, self.b.load, self.b.session)
         )
         self.dt = np.asarray(self.b.dt).ravel()
-        self.turn, self.speed_change, self.amps = (
+        self.turn, self.speed_change, self.direction, self.amps = (
             np.asarray(x).reshape(-1, x.shape[2])
-            for x in (self.b.turn, self.b.speed_change, self.b.current)
+            for x in (self.b.turn, self.b.speed_change, self.b.direction, self.b.current)
         )
 
     def frame(self, v):
@@ -86,8 +86,10 @@ class Rival:
         turns = rim * pull / active
         rolled = v["surfaces", "roller_drag"][self.floor][:, None] * turns * np.abs(turns)
         borne = load * driven + m["rolling_drag"] * rolled / rim.shape[1]
-        torque = v["geometry", "wheel_radius"] * weight * borne
-        drag = m["coulomb_friction"] * np.tanh(speed / 0.2) + m["viscous_friction"] * speed
+        steady = np.tanh(self.turn / self.dt[:, None] / 0.2)
+        moving = np.linalg.norm(self.direction, axis=1) / np.linalg.norm(steady, axis=1)
+        torque = v["geometry", "wheel_radius"] * weight * borne * np.minimum(moving, 1)[:, None]
+        drag = m["coulomb_friction"] * self.direction + m["viscous_friction"] * speed
         amps = (torque + drag) / (self.g.gear_ratio * m["efficiency"] * m["back_emf"])
         amps = np.sqrt(amps**2 + SMOOTHING_A**2) if not self.b.signed else amps
         pieces = len(self.b.dt)

@@ -44,6 +44,7 @@ def windows(shape, seed=0, runs=24, count=4):
         dt=np.full((runs, count), 0.5),
         turn=0.5 * turn,
         speed_change=rng.normal(size=turn.shape),
+        direction=np.tanh(turn / 0.2),
         pose=np.zeros((runs, count + 1, 3)),
         current=zero,
         voltage=zero,
@@ -132,7 +133,8 @@ def test_corrections_come_back_from_their_names_and_numbers():
     shape = SHAPES["differential"]
     w = driven(shape, windows(shape), with_truth(shape, "full_linear"))
     fitted = [model.fit(w, robot(shape)) for model in slip_models(shape, has_current=True)]
-    names = ["nominal", "encoder", "effective_track", "instantaneous_centres", "full_linear"]
+    names = ["nominal", "encoder", "calibrated"]
+    names += ["effective_track", "instantaneous_centres", "full_linear"]
     assert [model.name for model in fitted] == names
     states = {r.name: {f: v.tolist() for f, v in r.state.items()} for r in fitted}
     for one, two in zip(fitted, restored(shape, states), strict=True):

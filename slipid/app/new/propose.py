@@ -74,7 +74,7 @@ def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[F
         return
     first = files[0].format.path
     try:
-        guessed = motor_layout(files[0].format, {}, signed=True)
+        guessed = motor_layout(files[0].format, {}, signed=True, pole_pairs=1.0)
     except DataError:
         return
     channels = ", ".join(channel.removeprefix("motor_") for channel in guessed.channels)

@@ -37,7 +37,7 @@ _TABLE: dict[str, str] = {
     "what voltage": "volt volts voltage voltages u spannung",
     "what duty": "duty pwm dutycycle throttle",
     "what battery": "bat batt battery bus supply vbat vbatt vbus ubat ubus",
-    "what rpm": "rpm",
+    "what rpm": "rpm erpm",
     "what gyro": "gyro gyroscope gz",
     "what yaw": "yaw heading theta th psi bearing hdg",
     "what angle": "angle angles ang phi rot rotation rotational",
@@ -57,7 +57,7 @@ _TABLE: dict[str, str] = {
         "data field fields msg value values actual measured meas feedback fb state states link "
         "robot base body global world map camera cam mocap vicon optitrack tag marker tracker "
         "lidar slam imu header twist coordinate coordinates coord axis of the from to in at along "
-        "log sensor drive shaft nsec sec secs ros"
+        "log sensor drive shaft nsec sec secs ros cycle today"
     ),
 }
 """Words in column names, by role and value: the key `side l` is the role `side` with value `l`."""
@@ -86,6 +86,16 @@ _BY_UNIT = {"tick": "ticks", "A": "current", "V": "voltage", "N*m": "torque", "r
 _SHORT = ("v", "a", "s", "m")
 """Endings that may be words as well: they are taken as units only if the whole name, with the
 ending as a word, has no meaning."""
+
+
+_OF_VESC = {
+    "ms_today": ("time", "ms"),
+    "input_voltage": ("bus_voltage", "V"),
+    "current_motor": ("current", "A"),
+    "current_in": ("", ""),
+}
+"""Channels and units of columns that VESC tool, which logs a motor's controller, gives a name of
+its own."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +153,8 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
         of_motor: True if the log is that of motors on a bench, whose columns need not name a wheel
             or motor.
     """
+    if of_motor and (exact := _OF_VESC.get(name.lower())):
+        return ColumnMeaning(exact[0], "", exact[1])
     bare, suffix = without_unit(name)
     unit = unit_in(unit) or unit or suffix
     texts = [bare] if "[" in name or "(" in name or "," in name else [bare, name]
@@ -290,8 +302,15 @@ def _apart(word: str) -> list[str]:
     return found
 
 
+def is_electrical(name: str) -> bool:
+    """Return whether a column has the speed of a motor's field: the shaft's times pole pairs."""
+    return "erpm" in name_parts(name).words("rpm")
+
+
 def _doubt(parts: NameParts, channel: str) -> str:
     """Return a question about an assumption that was made about a name, empty if none was made."""
+    if "erpm" in parts.words("rpm"):
+        return "erpm is the shaft's speed times the motor's pole pairs: give scale = 1 / pole pairs"
     if channel.startswith("twist") and not parts.has("what", "command"):
         return "is it a command? Measured speeds must not be used here"
     if parts.mended:
@@ -305,7 +324,7 @@ def _doubt(parts: NameParts, channel: str) -> str:
 
 def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
     """Return the channel and the label of a name, or None if it has no known meaning."""
-    if parts.has("not"):
+    if parts.has("not") or _of_axis(parts):
         return ("odometry", "") if parts.has("not", "odometry") else None
     label = _label(parts)
     single = _single(parts)
@@ -321,9 +340,15 @@ def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
     return f"{'motor' if parts.has('kind', 'motor') else 'wheel'}_{what}", label
 
 
+def _of_axis(parts: NameParts) -> bool:
+    """Return whether a name is that of a current or voltage along the axis d or q of a motor."""
+    electric = parts.has("what", "current", "voltage")
+    return electric and any(word in ("d", "q") for _, _, word in parts.roles)
+
+
 def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
     """Return the channel and the label of a name in a log of motors on a bench, or None."""
-    if parts.has("not"):
+    if parts.has("not") or _of_axis(parts):
         return None
     single = _single(parts)
     if single and single[0] in ("time", "bus_voltage"):

@@ -1,11 +1,12 @@
 """Layout of a log of motors on a bench, from columns named by the user or found by their names."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from slipid.data.reading.column_names import (
     ColumnMeaning,
+    is_electrical,
     meaning_of,
     stamp_columns,
     unit_in,
@@ -43,7 +44,12 @@ def given_columns(text: str, channel: str) -> GivenColumns:
     return GivenColumns(tuple(n.strip() for n in text.split(",")), None)
 
 
-def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed: bool) -> Layout:
+def motor_layout(
+    format: TableFormat,
+    given: Mapping[str, GivenColumns],
+    signed: bool,
+    pole_pairs: float | None = None,
+) -> Layout:
     """Return the layout of a log of motors.
 
     For channels without given columns, columns are found by their names.
@@ -52,9 +58,12 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
         format: format of the file, with the lines of its names and numbers.
         given: columns named by the user, keyed by channel.
         signed: True if currents have a sign.
+        pole_pairs: pole pairs of the motor, by which an electrical speed is divided; None if the
+            speed is that of the shaft.
 
     Raises:
-        DataError: a given column is absent, or there is no column for time, current or speed.
+        DataError: a given column is absent, or there is no column for time, current or speed; or
+            the speed is electrical, and no pole pairs are given.
     """
     names = [name for name in format.names if name]
     if not names:
@@ -85,6 +94,8 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
     if "voltage" not in channels and not {"duty", "bus_voltage"} <= channels.keys():
         channels = {k: v for k, v in channels.items() if k not in ("duty", "bus_voltage")}
     _check_whole(format.path, channels, names)
+    if (speed := channels.get("motor_speed")) is not None:
+        channels["motor_speed"] = _of_shaft(format.path, speed, pole_pairs)
     return Layout(
         channels=channels,
         delimiter=format.delimiter or ",",
@@ -123,6 +134,19 @@ def _channel(
     return Channel(columns, unit or next(known, usual))
 
 
+def _of_shaft(path: Path, speed: Channel, pole_pairs: float | None) -> Channel:
+    """Return the speed of the shaft; raise `DataError` if it is electrical without pole pairs."""
+    electrical = [str(column) for column in speed.columns if is_electrical(str(column))]
+    if electrical and pole_pairs is None:
+        found = f"column '{electrical[0]}' has the electrical speed, the shaft's times pole pairs"
+        expected = (
+            "--pole-pairs with their number: half the number of magnets on the rotor, such as 7 "
+            "for 14 magnets"
+        )
+        raise bad_data(path, found, expected)
+    return replace(speed, scale=(1.0 / (pole_pairs or 1.0),))
+
+
 def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) -> None:
     """Raise `DataError` if a required channel is missing, or channels differ in number of motors.
 
@@ -136,6 +160,13 @@ def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) 
     ):
         if not {*wanted} & channels.keys():
             what = " or ".join(n.removeprefix("motor_") for n in wanted)
+            if wanted == ("current",) and "voltage" in channels:
+                found = (
+                    "no column for the current: voltage and speed alone tell kS, kV and kA (the "
+                    "voltages for friction, speed and acceleration), which slipid does not fit yet"
+                )
+                expected = f"--current with the column of the motor's current; {have}"
+                raise bad_data(path, found, expected)
             raise bad_data(path, f"no column for the {what}", f"{option} with its name; {have}")
     count = {k: len(c.columns) for k, c in channels.items() if k not in ("time", "bus_voltage")}
     if len({*count.values()}) > 1:

@@ -32,7 +32,7 @@ _UNITS = (
     "minute = 60 * second = min",
     "hour = 3600 * second = h",
     "degree = 3.141592653589793 / 180 * radian = deg",
-    "revolution = 6.283185307179586 * radian = rev = turn",
+    "revolution = 6.283185307179586 * radian = rev = turn = rot",
     "rpm = revolution / minute",
     "fraction = []",
     "percent = 0.01 * fraction = %",

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from slipid.data.windows import Windows
 from slipid.fitting import likelihood as lk
 from slipid.infer.result import Channels
+from slipid.model.motor import sign_of_motion
 from slipid.model.robot import Robot
 from slipid.predict.open_loop import chain
 
@@ -169,6 +170,7 @@ def steady_windows(
         dt=dt,
         turn=dt[..., None] * rate[:, None],
         speed_change=blank,
+        direction=np.broadcast_to(sign_of_motion(rate[:, None]), blank.shape),
         pose=np.zeros((n, per_piece + 1, 3)),
         current=blank,
         voltage=blank,
@@ -198,5 +200,5 @@ def _sensed(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
     amps = lk.predicted_current(robot, b, p.motor_force)
     speed = lk.wheel_speed(robot, b)
     flow = amps - robot.motor.current_offset
-    volts = robot.motor.voltage(flow if b.signed else flow * jnp.tanh(speed / 0.2), speed)
+    volts = robot.motor.voltage(flow if b.signed else flow * sign_of_motion(speed), speed)
     return pose, amps, volts

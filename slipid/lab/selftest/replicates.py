@@ -32,7 +32,7 @@ from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
 from slipid.model.camera import Camera
-from slipid.model.motor import Motor
+from slipid.model.motor import Motor, sign_of_motion
 from slipid.model.robot import Robot
 from slipid.predict.open_loop import chain, contact_increments
 from slipid.predict.slip_model import as_increments
@@ -75,7 +75,7 @@ def simulate_windows(
     flowing = amps + same + each * rng.normal(size=amps.shape)
     speed = w.turn / w.dt[..., None]
     signed = flowing - float(truth.motor.current_offset)
-    signed = signed if w.current_is_signed else signed * np.tanh(speed / 0.2)
+    signed = signed if w.current_is_signed else signed * np.asarray(sign_of_motion(speed))
     volts = np.asarray(_voltage(truth.motor, signed, speed))
     current = flowing + np.sqrt(w.current_var) * rng.normal(size=amps.shape)
     voltage = volts + rng.normal(size=amps.shape) * std.get("voltage.window", 0.0)

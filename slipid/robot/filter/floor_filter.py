@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.model.contact import settle
 from slipid.model.contact_balance import Balance, stand
+from slipid.model.motor import sign_of_motion
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import Planar, advance, compose, solve3
 from slipid.robot.deployed import RobotArrays
@@ -290,7 +291,7 @@ class FloorFilter(eqx.Module):
         current is assumed to be uniformly distributed.
         """
         motor = self.robot.motor
-        return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
+        return (1 - sign_of_motion(w) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
 
     def _after_floor_changes(
         self, old: FloorState, xi: Array, tick: TimeStep, mapped: Array | None

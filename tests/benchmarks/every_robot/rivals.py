@@ -222,6 +222,8 @@ def least_squares_fit(robot: MadeRobot, tracks: list[Track]) -> Fitted:
     still[-7:-4] = robot.pose_kind == "heading"
     still[-3:] = robot.drive != "steered"
     still[-5] = robot.pose_kind == "xy"
+    if max(np.ptp(track.pose[:, 2]) for track in tracks) < 0.5:
+        still[f * d : f * d + f] = still[-7:-5] = True  # no turn tells tracks or the sensor's place
     free = np.flatnonzero(~still)
 
     def unpack(z: np.ndarray) -> Kinematics:

@@ -91,5 +91,5 @@ def covered(robot: MadeRobot, fitted: Fitted) -> dict[str, bool]:
     truth, found = true(robot), {}
     for name, number in numbers(robot).items():
         low, high = fitted.interval(number)
-        found[name] = low <= number(truth) <= high
+        found[name] = bool(low <= number(truth) <= high)
     return found

@@ -39,7 +39,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import least_squares
 
 from slipid.lab.systems.floors.interface import FloorSignals
-from slipid.model.motor import Motor
+from slipid.model.motor import Motor, sign_of_motion
 from slipid.model.robot import Robot
 
 FITTED = ("friction", "creep", "rolling_resistance")
@@ -225,9 +225,6 @@ def _residuals(
 _jacobian = jax.jit(jax.jacfwd(_residuals))
 
 
-SIGN_WIDTH = 0.2
-"""Scale of the wheel speed in tanh(speed / SIGN_WIDTH), the smooth sign of motion that friction and
-readings follow, as in `slipid.model.motor` [rad/s]."""
 STEADY_A = 0.1
 """Standard deviation of the current of a wheel at rest [A]."""
 
@@ -250,11 +247,14 @@ class MeteredMotor(Motor):
         return cls(**same, stiffness=stiffness, scatter=scatter)
 
     def current(
-        self, torque: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
+        self,
+        torque: Float[Array, " *w"],
+        wheel_speed: Float[Array, " *w"],
+        direction: Float[Array, " *w"] | None = None,
     ) -> Float[Array, " *w"]:
         """Return the mean reading of each drive's ammeter [A] at a wheel torque [N m]."""
-        sign = jnp.tanh(wheel_speed / SIGN_WIDTH)
-        along = sign * super().current(torque, wheel_speed) + jnp.abs(sign) * self.stiffness
+        sign = sign_of_motion(wheel_speed) if direction is None else direction
+        along = sign * super().current(torque, wheel_speed, sign) + jnp.abs(sign) * self.stiffness
         return clipped(along, STEADY_A + jnp.abs(sign) * self.scatter)
 
 
