@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from slipid.app.config import read_config
 from slipid.app.problem import read_fit_task
 from slipid.support.progress import Reporter
-from tests.benchmarks.every_robot import drive, rivals, score
+from tests.benchmarks.every_robot import drive, fits, rivals, score
 from tests.benchmarks.every_robot.robots import ROBOTS, Floor, Grip
 
 NAMED = {robot.name: robot for robot in ROBOTS}
@@ -105,3 +107,52 @@ def test_rows_stand_only_where_something_changed(tmp_path):
         cells = np.concatenate([track.angle, track.pose], axis=1)
         assert (np.abs(np.diff(cells, axis=0)).max(1) > 1e-6).all()
         assert np.diff(track.t).max() > 2.5 / robot.rate
+
+
+PERFECT = 0.03
+"""Largest error of true numbers where nothing is noisy [% of the path]."""
+KINDS = (
+    "diff_large_lag",
+    "diff_positions",
+    "diff_heading",
+    "skid_two_floors",
+    "omni3_marker",
+    "omni4_load_slip",
+    "mecanum_two_floors",
+    "tricycle_front",
+    "ackermann_understeer",
+)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_true_numbers_predict_what_noiseless_sensors_log(name, tmp_path):
+    robot = replace(NAMED[name], noise_m=0, noise_rad=0, wheel_noise=0, ticks=0, runs=1)
+    truth = drive.write(robot, tmp_path, 0)
+    fresh, k = rivals.read(robot, tmp_path / "fresh"), rivals.true(robot)
+    found = score.row(robot, rivals.truth(robot), k, fresh, truth)
+    assert max(found.values()) < PERFECT
+    wrong = replace(k, lag=k.lag + 0.1, base={f: 1.1 * b for f, b in k.base.items()})
+    worse = score.row(robot, rivals.kinematic(robot, wrong), wrong, fresh, truth)
+    assert min(worse.values()) > 10 * PERFECT
+
+
+def test_intervals_in_identified_json_are_judged():
+    robot = NAMED["diff_own"]
+
+    def number(value, error=0.0):
+        return {"value": value + error, "interval90": [value + error - 1e-4, value + error + 1e-4]}
+
+    calibration = {
+        "surfaces": {
+            floor.name: {
+                "rolling_radius_m": [number(r) for r in floor.radius],
+                "effective_track_m": number(floor.base, 0.001 if floor.name == "tile" else 0.0),
+            }
+            for floor in robot.floors
+        },
+        "pose_offset_m": [number(0.060), number(0.010)],
+        "pose_lag_s": number(0.040, 0.0002),
+    }
+    found = fits.covered(robot, calibration)
+    assert len(found) == 9
+    assert {name for name, held in found.items() if not held} == {"base tile", "lag"}

@@ -44,7 +44,9 @@ def answer(robot: MadeRobot, folder: Path, truth: dict[str, Judged]) -> Answer:
     content = json.loads((out / "identified.json").read_text(encoding="utf-8"))
     run = json.loads((out / "run.json").read_text(encoding="utf-8"))
     verdict = (content.get("trust") or run["trust"])["verdict"]
-    inside = covered(robot, content["calibration"]) if "calibration" in content else {}
+    inside = covered_motors(robot, content["parameters"])
+    if "calibration" in content:
+        inside |= covered(robot, content["calibration"])
     selected = content.get("selected_model", {})
     file = out / "validation.json"
     done = invoke("validate", out, "--data", folder / "fresh", "--json", file, "--quiet")
@@ -88,4 +90,21 @@ def covered(robot: MadeRobot, calibration: dict) -> dict[str, bool]:
         if stated.get(name, {}).get("interval90") is not None:
             low, high = stated[name]["interval90"]
             found[name] = bool(low <= number(truth) <= high)
+    return found
+
+
+def covered_motors(robot: MadeRobot, parameters: dict) -> dict[str, bool]:
+    """Whether the intervals of the motors' numbers in identified.json hold the true ones."""
+    if robot.motors is None:
+        return {}
+    right = {
+        "motor.resistance": robot.motors.resistance,
+        "motor.back_emf": robot.motors.back_emf,
+        "motor.coulomb_friction": robot.motors.coulomb,
+        "motor.viscous_friction": robot.motors.viscous,
+    }
+    found = {}
+    for path, value in right.items():
+        low, high = parameters[path]["interval90"]
+        found[path] = bool(low <= value <= high)
     return found

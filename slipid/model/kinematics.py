@@ -1,0 +1,91 @@
+"""Calibrated kinematics: the body twist of wheels with effective sizes, floor by floor.
+
+For drive j on floor k, with wheel speeds w_j [rad/s] and effective rolling radii r_kj [m]:
+
+    xi = S_k J^+ (r_k1 w_1, r_k2 w_2, ...)
+
+where J^+ is the pseudo-inverse of the geometry that the config gives, and S_k corrects its scale in
+yaw. Wheels that determine the twist have an effective base, of which L_k / L is the ratio to the
+geometry's:
+
+    S_k = diag(1, 1, L / L_k)
+
+Wheels that all point ahead have an effective track b_k, and turn about a point x_k [m] ahead of the
+axle's middle:
+
+    v = mean(r w),  W = (mean_right(r w) - mean_left(r w)) / b_k,  v_y = -x_k W
+
+Source: effective track, the `wheel_separation_multiplier` of ROS controllers; centre of rotation,
+Mandow et al. 2007, IROS; rolling omni wheels, Indiveri 2009, IEEE T-RO 25(1).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.model.geometry import Geometry
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """Calibrated kinematics of the drives of a robot on each of its floors.
+
+    Attributes:
+        labels: names of the floors.
+        rolling: pseudo-inverse J^+ of the geometry, from rim speeds to the body twist.
+        nominal_base: base or track of the geometry that `rolling` belongs to [m].
+        radius: effective rolling radius of every drive on every floor [m].
+        base: effective track, or effective base of wheels that determine the twist [m].
+        centre: point about which the robot turns, ahead of the axle's middle [m]; zero for wheels
+            that determine the twist.
+    """
+
+    labels: tuple[str, ...]
+    rolling: Float[np.ndarray, "3 drive"]
+    nominal_base: float
+    radius: Float[np.ndarray, "floor drive"]
+    base: Float[np.ndarray, " floor"]
+    centre: Float[np.ndarray, " floor"]
+
+    def matrices(self) -> Float[np.ndarray, "floor 3 drive"]:
+        """Return the matrices from wheel speeds [rad/s] to body twists [m/s, m/s, rad/s]."""
+        return matrices(self.rolling, self.radius, self.base / self.nominal_base, self.centre)
+
+    def matrix(self, floor: str) -> Float[np.ndarray, "3 drive"]:
+        """Return the matrix of one floor; raise `ValueError` if the floor was not calibrated."""
+        if floor not in self.labels:
+            raise ValueError(f"no surface '{floor}'; calibrated: {', '.join(self.labels)}")
+        return self.matrices()[self.labels.index(floor)]
+
+
+def matrices(
+    rolling: Float[np.ndarray, "3 drive"],
+    radius: Float[np.ndarray, "*batch drive"],
+    base_ratio: Float[np.ndarray, "*batch"],
+    centre: Float[np.ndarray, "*batch"],
+) -> Float[np.ndarray, "*batch 3 drive"]:
+    """Return the matrices from wheel speeds [rad/s] to body twists; see the module docstring.
+
+    `base_ratio` is the effective base over that of the geometry; lengths are in metres.
+    """
+    out = rolling * radius[..., None, :]
+    out[..., 2, :] /= np.asarray(base_ratio)[..., None]
+    out[..., 1, :] -= centre[..., None] * out[..., 2, :]
+    return np.asarray(out)
+
+
+def nominal_base(shape: Geometry) -> float:
+    """Return the length that the yaw rate of the wheels is inversely proportional to [m].
+
+    It is the track of wheels that point ahead, lx + ly of mecanum wheels, and the distance of omni
+    wheels from the middle.
+    """
+    arm = np.abs(np.asarray(shape.forward())[:, 2])
+    return float(arm.mean()) * (1.0 if shape.determines_twist else 2.0)
+
+
+def is_axle(shape: Geometry) -> bool:
+    """Return whether all ordinary wheels are on one axle, whose middle the robot turns about."""
+    place = np.asarray(shape.place) * float(shape.base_radius)
+    return all(shape.grips) and float(np.ptp(place[:, 0])) < 1e-3 * float(shape.base_radius)

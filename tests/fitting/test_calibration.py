@@ -1,0 +1,127 @@
+"""Calibration of made robots whose kinematics, pose sensor and lag are known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slipid.app.config import read_config
+from slipid.app.problem import read_fit_task
+from slipid.data.runs import collect
+from slipid.fitting.calibration import Calibration, Value, calibrate
+from slipid.search_space import Choice, Space
+from slipid.support.progress import Reporter
+from tests.benchmarks.every_robot.drive import write
+from tests.benchmarks.every_robot.fits import covered
+from tests.benchmarks.every_robot.robots import ROBOTS, MadeRobot
+
+MADE = {robot.name: robot for robot in ROBOTS}
+
+
+@pytest.fixture(scope="module")
+def task_of(tmp_path_factory):
+    """Return a function from a made robot to its fit task."""
+    made = {}
+
+    def read(robot: MadeRobot):
+        if robot.name not in made:
+            folder: Path = tmp_path_factory.mktemp(robot.name)
+            write(robot, folder, seed=3)
+            with Reporter(quiet=True) as report:
+                made[robot.name] = read_fit_task(
+                    read_config(folder / "robot.toml"), folder / "logs", report
+                )
+        return made[robot.name]
+
+    return read
+
+
+def calibrated(task, *more: Choice, runs=None) -> Calibration:
+    choices = [*task.choices, *more]
+    data = task.dataset if runs is None else task.dataset.subset(runs)
+    return calibrate(data, Space(task.robot, choices), choices)
+
+
+def near(found: Value, truth: float, within: float) -> bool:
+    return abs(found.value - truth) < within and found.verdict == "identified"
+
+
+@pytest.mark.parametrize("name", ["diff_umbmark", "omni3_marker", "mecanum_wrong_base"])
+def test_intervals_hold_the_true_numbers(task_of, name):
+    """Nine in ten hold each; that two of seven fail has a probability of 15 %, three of 2 %."""
+    robot = MADE[name]
+    inside = covered(robot, calibrated(task_of(robot)).to_json())
+    assert len(inside) >= 6
+    assert sum(not held for held in inside.values()) <= 2, inside
+
+
+def test_own_differential_drive(task_of):
+    """Radii by floor to .1 %, the track, and place and lag of a tracker ahead of the axle."""
+    found = calibrated(task_of(MADE["diff_own"]))
+    for floor, radius in (("carpet", 0.0757), ("tile", 0.0770)):
+        assert all(near(r, radius, 1e-3 * radius) for r in found.radius[floor])
+        assert near(found.base[floor], 0.448, 1e-3)
+    assert near(found.offset[0], 0.060, 1e-3)
+    assert near(found.offset[1], 0.010, 1e-3)
+    assert near(found.lag, 0.040, 2e-3)
+    assert found.firmest == "tile"
+    radius, track = found.multipliers["tile"]
+    assert radius == pytest.approx([0.0770 / 0.0762] * 2, rel=1e-3)
+    assert track == pytest.approx(0.448 / 0.46, rel=2e-3)
+
+
+def test_skid_steer_has_a_track_and_a_centre_on_each_floor(task_of):
+    found = calibrated(task_of(MADE["skid_two_floors"]))
+    assert near(found.base["asphalt"], 0.825, 0.01)
+    assert near(found.base["grass"], 0.99, 0.012)
+    assert found.centre["asphalt"].verdict == "fixed"
+    assert near(found.centre["grass"], -0.06, 0.01)
+
+
+def test_what_only_turning_tells_is_not_identified_without_turns(task_of):
+    found = calibrated(task_of(MADE["diff_straight"]))
+    assert found.base["floor"].verdict == "not_identified"
+    assert found.base["floor"].value == pytest.approx(0.31)
+    assert [place.verdict for place in found.offset] == ["not_identified"] * 2
+    assert [place.value for place in found.offset] == [0.0, 0.0]
+
+
+def test_positions_without_headings(task_of):
+    """Radii, track and the place of an antenna follow from positions alone."""
+    data = task_of(MADE["diff_own"]).dataset
+    logs = []
+    for log in data.logs:
+        pose = log.pose.copy()
+        pose[:, 2] = np.nan
+        logs.append(replace(log, pose=pose))
+    task = replace(task_of(MADE["diff_own"]), dataset=collect(logs))
+    found = calibrated(task, Choice("camera.lag", fixed=0.04))
+    assert near(found.radius["tile"][0], 0.0770, 5e-4)
+    assert near(found.base["tile"], 0.448, 3e-3)
+    assert near(found.offset[0], 0.060, 3e-3)
+
+
+def test_a_number_that_the_config_fixes_stays(task_of):
+    found = calibrated(task_of(MADE["diff_own"]), Choice("camera.lag", fixed=0.02))
+    assert found.lag.value == 0.02
+    assert found.lag.verdict == "fixed"
+    assert found.lag.interval90 == (0.02, 0.02)
+
+
+def test_intervals_from_one_run_are_wider_than_from_all(task_of):
+    task = task_of(MADE["diff_umbmark"])
+    one, every = calibrated(task, runs=[0]), calibrated(task)
+    width = [np.ptp(found.base["floor"].interval90) for found in (one, every)]
+    assert width[0] > 1.3 * width[1]
+    low, high = one.base["floor"].interval90
+    assert low < 0.170 < high
+
+
+def test_a_run_with_a_wrong_label_has_little_weight(task_of):
+    """One run on tile is labelled carpet: it is an outlier there, by its radius of 3 % more."""
+    found = calibrated(task_of(MADE["diff_wrong_label"]))
+    for floor, radius in (("carpet", 0.0485), ("tile", 0.050)):
+        low, high = found.radius[floor][0].interval90
+        assert low < radius < high
+        assert found.radius[floor][0].value == pytest.approx(radius, rel=5e-3)
