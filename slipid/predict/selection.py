@@ -10,11 +10,11 @@ least `LEAST_SECTORS` of them, else in groups of runs. The models without a fold
 models of all runs by one Gauss-Newton step (`fitting.newton`, `fitting.calibration`). A floor with
 a single run has no held-out run; its run is predicted by the models that were fitted to it.
 
-The error of a run is the largest of the distance between predicted and measured end point and of
-the error of the farthest distance from the start, over the path length. The latter shows a wrong
-scale on closed paths, where end points do not.
+The error of a run is the mean, over the whole run and its three halves from its beginning, quarter
+and middle on, of the distance between predicted and measured end point over the path length. Every
+part begins at its measured pose. Closed paths hide a wrong scale at their end, but not in parts.
 
-Source: one-standard-error rule, Breiman et al. 1984, Classification and Regression Trees; folds by
+Source: errors over parts of paths, Geiger et al. 2012, CVPR (KITTI); one-standard-error rule, Breiman et al. 1984, Classification and Regression Trees; folds by
 one Newton step, Beirami et al. 2017, NeurIPS.
 """
 
@@ -34,7 +34,8 @@ from slipid.predict import open_loop as replay
 from slipid.predict.folds import fold_keys, sectors
 from slipid.predict.kinematics import Calibrated, nominal
 from slipid.predict.predictive import force_balance_of
-from slipid.predict.score import clusters, lengths, mean_error
+from slipid.predict.score import clusters, mean_error
+from slipid.predict.slip_model import turned
 from slipid.predict.slip_models import FloorModels
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
@@ -170,15 +171,30 @@ def selected(data: Runs, errors: Errors) -> dict[str, FloorSelection]:
     return out
 
 
+PARTS = ((0.0, 1.0), (0.0, 0.5), (0.25, 0.75), (0.5, 1.0))
+"""Beginnings and ends of the parts of a run that are judged, as fractions of its path length."""
+
+
 def path_errors(tracks: replay.Tracks) -> Float[np.ndarray, " run"]:
     """Return the error of every track over its path length; see the module docstring."""
-    far = [
-        np.linalg.norm(path[..., :2] - path[:, :1, :2], axis=-1).max(axis=1)
-        for path in (tracks.predicted, tracks.measured)
-    ]
-    end = np.linalg.norm(tracks.gap[:, :2], axis=1)
-    path = np.maximum(lengths(tracks.measured), 1e-9)
-    return np.asarray(np.maximum(end, np.abs(far[0] - far[1])) / path)
+    step = np.linalg.norm(np.diff(tracks.measured[..., :2], axis=1), axis=2)
+    far = np.concatenate([np.zeros((len(step), 1)), np.cumsum(step, axis=1)], axis=1)
+    errors = []
+    for begin, end in PARTS:
+        i, j = (np.abs(far - part * far[:, -1:]).argmin(axis=1) for part in (begin, end))
+        moved = [_between(path, i, j) for path in (tracks.predicted, tracks.measured)]
+        rows = np.arange(len(far))
+        path = np.maximum(far[rows, j] - far[rows, i], 1e-9)
+        errors.append(np.linalg.norm(moved[0] - moved[1], axis=1) / path)
+    return np.asarray(np.mean(errors, axis=0))
+
+
+def _between(
+    path: Float[np.ndarray, "run edge 3"], i: np.ndarray, j: np.ndarray
+) -> Float[np.ndarray, "run 2"]:
+    """Return the position at edge j of every path, in the frame of its pose at edge i [m]."""
+    rows = np.arange(len(path))
+    return turned(-path[rows, i, 2], path[rows, j, :2] - path[rows, i, :2])
 
 
 def _picked(data: Runs, fold: Int[np.ndarray, " run"]) -> dict[int, Int[np.ndarray, " some"]]:

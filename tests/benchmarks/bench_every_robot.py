@@ -46,6 +46,7 @@ OUT = ROOT / "out" / "bench_every_robot" / CODE.hexdigest()[:8]  # nothing of ot
 SEEDS = int(os.environ.get("SLIPID_BENCH_SEEDS", quick("8", "1")))
 FEW = ("diff_umbmark", "diff_positions", "mecanum_wrong_base", "bicycle_zero")
 TRIED = [robot for robot in ROBOTS if robot.name in quick([r.name for r in ROBOTS], FEW)]
+NAMED = {robot.name: robot for robot in ROBOTS}
 ROWS = "nominal", "squares", "floor", "calibrated", "contact", "selected"
 
 
@@ -91,7 +92,7 @@ def test_robot(robot: MadeRobot, tmp_path: Path) -> None:
     print(f"\n{HEAD}\n{line(records)}")
     rows = mean_rows(records)
     if robot.determined:
-        assert rows["squares"] < quick(1.5, 3.0) * rows["floor"] + 0.1
+        assert rows["squares"] < (1.5 if SEEDS >= 8 else 3.0) * rows["floor"] + 0.1
     assert rows["floor"] < min(rows["squares"], rows["nominal"]) + 0.3
 
 
@@ -124,12 +125,14 @@ def line(records: list[dict]) -> str:
 
 
 def behind(records: list[dict]) -> str | None:
-    """Return why slipid is behind the rivals, or None."""
+    """Return why slipid is behind the rivals, or None; also where it cannot read the config yet."""
+    if not NAMED[records[0]["robot"]].readable:
+        return None
     rows = mean_rows(records)
     best = min(rows["nominal"], rows["squares"])
     deployed = rows.get("selected", rows.get("contact"))
     if deployed is None:
-        return f"{records[0]['robot']}: no answer"
+        return f"{records[0]['robot']}: no answer ({records[0]['verdict'].partition(':')[0]})"
     if deployed > 1.1 * best + 0.05:
         return f"{records[0]['robot']}: {deployed:.2f} % of the path, a rival {best:.2f} %"
     return None

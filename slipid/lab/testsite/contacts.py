@@ -3,12 +3,19 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.ordinary_build import IMPEDANCE, OrdinaryBuild
 from slipid.lab.testsite.robot_build import RobotBuild
 from slipid.lab.testsite.surfaces import GRAVITY, Terrain
 
+CREEP_RATE = 200.0
+"""Rate at which creep follows a change of force [1/s].
+
+The engine's friction also resists accelerations, among them that towards the middle of a curve, the
+less the higher this rate is.
+"""
 POINTS = 2
 """Number of points at which a cylinder touches a plane [1]."""
 
@@ -93,11 +100,9 @@ class TreadContacts:
         self._castor_bearing = robot.castor_friction_nm
         self._load = robot.mass_kg * GRAVITY * robot.support_share(load)
         points = np.array([POINTS] * count + [1] * (len(names) - count))
-        # A contact's stiffness times `soft` is what the engine calls its stiffness; damping alike.
-        inverse_mass = model.body_invweight0[model.geom_bodyid[self._geom], 0]
-        self._soft = (1 - IMPEDANCE) * inverse_mass / points
-        self._shear_soft = self._soft / model.opt.impratio
-        self._most = 0.5 * IMPEDANCE / timestep  # above this damping the engine is unstable
+        self._points, self._firmness = points, model.opt.impratio
+        self._inverse_mass = model.body_invweight0[model.geom_bodyid[self._geom], 0]
+        self._fastest = 0.5 / timestep
         third = robot.mass_kg * GRAVITY / 3
         kinds = terrain.kinds
         self._friction = np.array([g.friction for g, _ in kinds])
@@ -114,20 +119,33 @@ class TreadContacts:
         if (now != self._beneath).any():
             self._beneath = now
             friction = self._friction[now, None]
-            normal = np.stack([self._stiffness[now], self._damping[now]], 1) * self._soft[:, None]
             m.pair_friction[self._pair, :2] = m.geom_friction[self._geom, :1] = friction
-            m.pair_solref[self._pair] = m.geom_solref[self._geom] = -normal
+            m.geom_solref[self._geom] = self._normal(now, IMPEDANCE)
             rolling = self._rolling[now] * self._load
             m.dof_frictionloss[self._dof] = self._bearing + rolling[:wheels]
             m.dof_frictionloss[self._castor_dofs] = self._castor_bearing + rolling[wheels:].sum()
         sinkage = np.maximum(self._radius - place[:wheels, 2], 1e-6)
         length = 2 * np.sqrt(2 * self._radius * sinkage)
         speed = np.abs(data.qvel[self._dof]) * self._radius
-        shear = self._shear[now[:wheels]] * length / np.maximum(speed, 1e-6)
-        gripping = np.full(len(now), self._most)
-        gripping[:wheels] = np.minimum(shear * self._shear_soft[:wheels], self._most)
+        damping = np.full(len(now), np.inf)  # of the friction at one point [N s/m]
+        damping[:wheels] = self._shear[now[:wheels]] * length / np.maximum(speed, 1e-6) / POINTS
+        # regularisation of the friction for which creep follows the force at the rate CREEP_RATE
+        soft = self._firmness * CREEP_RATE / damping
+        impedance = np.clip(self._inverse_mass / (self._inverse_mass + soft), 1e-3, IMPEDANCE)
+        scale = (1 - impedance) * self._inverse_mass / self._firmness
+        m.pair_solimp[self._pair, :2] = impedance[:, None]
+        m.pair_solref[self._pair] = self._normal(now, impedance)
         m.pair_solreffriction[self._pair, 0] = -1.0  # without effect: friction has no position
-        m.pair_solreffriction[self._pair, 1] = -gripping
+        m.pair_solreffriction[self._pair, 1] = -np.minimum(
+            damping * scale, self._fastest * impedance
+        )
+
+    def _normal(
+        self, kinds: Int[np.ndarray, " contact"], impedance: Float[np.ndarray, " contact"] | float
+    ) -> Float[np.ndarray, "contact 2"]:
+        """Return the engine's numbers for stiffness and damping of the floor under a contact."""
+        scale = (1 - impedance) * self._inverse_mass / self._points
+        return -np.stack([self._stiffness[kinds], self._damping[kinds]], 1) * scale[:, None]
 
 
 def contacts_of(

@@ -12,11 +12,7 @@ from slipid.support.content import Content
 from slipid.support.toml_file import CLOSED, NotNegative, Positive
 
 IMPEDANCE = 0.1
-"""Impedance of the engine's contacts beneath wheels and castor [1].
-
-The engine adds inertia to a contact, less of it at a low impedance; the forces of steady motion do
-not depend on it.
-"""
+"""Largest impedance of the engine's contacts beneath wheels and castor [1]."""
 RadiusError = Annotated[float, Field(gt=-0.2, lt=0.2)]
 """True radius of a wheel over its nominal radius, less 1 [1]."""
 

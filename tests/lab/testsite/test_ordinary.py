@@ -169,8 +169,10 @@ def test_a_robot_that_drives_straight_goes_as_far_as_its_wheels_roll(robot):
 
 
 def test_a_skid_that_turns_on_the_spot_needs_a_wider_track_than_it_has():
-    """Where friction is equal ahead and sideways, the moment balance of four equally loaded wheels
-    that slide is met at a track of b (1 + (a / b)^2), for a wheelbase a and a track b."""
+    """Four equally loaded wheels slide without a moment at an effective track b (1 + (a / b)^2).
+
+    a is the wheelbase, b the track, and friction is equal ahead and sideways.
+    """
     run = straight("firm", "as_built", 0.0, 0.0, 0.25, 1.0)
     trace = driven(run, SKID)
     track = 0.1 * np.ptp(trace.wheel_angle, axis=0).sum() / np.ptp(trace.pose[:, 2])
@@ -180,6 +182,14 @@ def test_a_skid_that_turns_on_the_spot_needs_a_wider_track_than_it_has():
     trace = driven(run, replace(DIFFERENTIAL, wheel_width_m=0.004))
     track = 0.08 * np.ptp(trace.wheel_angle, axis=0).sum() / np.ptp(trace.pose[:, 2])
     assert track == pytest.approx(DIFFERENTIAL.track_m, rel=0.02)
+
+
+def test_a_skid_of_equal_halves_turns_about_its_middle_on_a_soft_floor():
+    """Friction that resisted accelerations would push it outwards in a curve."""
+    run = straight("soft", "as_built", 0.0, 0.4, 0.6, 0.4)
+    trace = driven(run, SKID)
+    found = effective_kinematics(SKID, [(run, trace.pose[::10], trace.wheel_angle[::10])])
+    assert abs(found["as_built"]["soft"]["arcs"]["centre_of_rotation_m"]) < 0.02
 
 
 @pytest.mark.slow
