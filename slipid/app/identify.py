@@ -15,17 +15,19 @@ from slipid.app.config import read_config
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.data.check.findings import wrong
+from slipid.fitting.calibration import Calibration
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
-from slipid.infer.result import Fit, required
+from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
 from slipid.infer.verdicts.trust import Trust
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.selection import (
+    Errors,
     calibrated_model,
     contact_errors,
     kinematic_errors,
@@ -94,7 +96,8 @@ def identify(
     report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")
     _check_sanity(task, report, anyway)
     task = with_mixed(task, data, report)
-    report.stage("cutting windows")
+    kinematic = calibrated(task, report)
+    task = task.started_from(kinematic.calibration)
     problem = task.problem()
     for path in profiles:
         try:
@@ -107,7 +110,7 @@ def identify(
     key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
     kept = Checkpoint(out, key)
     problem, optimum = optimised(task, problem, kept, report)
-    fit = summarised(task, problem, optimum, report)
+    fit = summarised(task, problem, optimum, report, kinematic)
     report.stage("writing")
     written = (*save(fit, out), "run.json", "config.toml")
     _write_run(task, fit.trust, data, out, time.monotonic() - began)
@@ -246,16 +249,45 @@ def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | Non
     return start, history
 
 
-def summarised(task: FitTask, problem: Problem, optimum: Optimum, report: Reporter) -> Fit:
+@dataclass(frozen=True, eq=False)
+class KinematicFit:
+    """Calibrated kinematics of a task.
+
+    Attributes:
+        calibration: calibration from all runs.
+        errors: errors of the kinematic models on held-out runs.
+    """
+
+    calibration: Calibration
+    errors: Errors
+
+
+def calibrated(task: FitTask, report: Reporter) -> KinematicFit:
+    """Return the calibrated kinematics of a task, and report their numbers."""
+    report.stage("calibrated kinematics")
+    space = Space(task.robot, task.choices)
+    found = KinematicFit(*kinematic_errors(task.dataset, space, task.choices))
+    for sentence in found.calibration.sentences:
+        report.line(sentence)
+    return found
+
+
+def summarised(
+    task: FitTask, problem: Problem, optimum: Optimum, report: Reporter, kinematic: KinematicFit
+) -> Fit:
     """Return the fit from an optimum, with intervals, verdicts and simpler models for comparison.
 
-    Runs over several floors, if the task has some, are fitted as well.
+    The slip model of every floor is selected. Runs over several floors, if the task has some, are
+    fitted as well.
     """
     report.stage("intervals and verdicts")
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
         fit = _with_mixed_runs(fit, task, problem, optimum, report)
-    fit = with_selection(fit, task, report)
+    report.stage("predicting held-out runs")
+    contact = contact_errors(task.dataset, problem, optimum)
+    selection = selected(task.dataset, {**kinematic.errors, "contact": contact})
+    fit = replace(fit, calibration=kinematic.calibration, selection=selection)
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
 
@@ -326,14 +358,3 @@ def _with_baselines(fit: Fit, task: FitTask) -> Fit:
         learnt = [own if model.name == own.name else model for model in learnt]
     plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}
     return replace(fit, baselines=plain)
-
-
-def with_selection(fit: Fit, task: FitTask, report: Reporter) -> Fit:
-    """Return the fit with its calibration, and with the slip model selected on every floor."""
-    report.stage("calibrated kinematics")
-    data = task.dataset
-    calibration, errors = kinematic_errors(data, Space(task.robot, task.choices), task.choices)
-    report.stage("predicting held-out runs")
-    contact = contact_errors(data, required(fit.problem), required(fit.optimum))
-    selection = selected(data, {**errors, "contact": contact})
-    return replace(fit, calibration=calibration, selection=selection)

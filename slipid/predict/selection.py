@@ -14,8 +14,9 @@ The error of a run is the mean, over the whole run and its three halves from its
 and middle on, of the distance between predicted and measured end point over the path length. Every
 part begins at its measured pose. Closed paths hide a wrong scale at their end, but not in parts.
 
-Source: errors over parts of paths, Geiger et al. 2012, CVPR (KITTI); one-standard-error rule, Breiman et al. 1984, Classification and Regression Trees; folds by
-one Newton step, Beirami et al. 2017, NeurIPS.
+Source: errors over parts of paths, Geiger et al. 2012, CVPR (KITTI); one-standard-error rule,
+Breiman et al. 1984, Classification and Regression Trees; folds by one Newton step, Beirami et al.
+2017, NeurIPS.
 """
 
 from collections.abc import Mapping, Sequence
