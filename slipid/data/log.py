@@ -60,7 +60,8 @@ class Log:
         bus_voltage: supply voltage [V], or None.
         gyro: yaw rate [rad/s], or None.
         pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the camera's log (not
-            corrected for a wrong camera scale), or None.
+            corrected for a wrong camera scale), or None; nan in coordinates that were not measured,
+            such as the heading of a satellite receiver or the position of a compass.
         pose_fresh: False where the row repeats the last pose.
         pose_clock: clock offset and drift, estimated from the motion, of poses that have times of
             their own; else None.

@@ -29,7 +29,8 @@ class Runs:
         offset: index of the first sample of each run; the last element is the number of samples.
         time: time within the run [s] (sample,).
         wheel_angle: angle of each wheel [rad] (sample, wheel), linear across telemetry stalls.
-        pose: x [m], y [m], heading [rad], in the scale of the log.
+        pose: x [m], y [m], heading [rad], in the scale of the log; nan in coordinates that were not
+            measured.
         fresh: False where the row repeats the last camera frame.
         live: False in the rows of a telemetry stall, whose currents are stale.
         current: motor currents [A] (sample, wheel), or None if a run has none.
@@ -132,7 +133,9 @@ def collect(
                 f"{log.name}: {log.wheels} wheels; expected {logs[0].wheels}, as in {logs[0].name}"
             )
         if log.pose is None:
-            raise DataError(f"{log.name}: no pose; expected pose columns, which a fit needs")
+            raise DataError(
+                f"{log.name}: no pose; expected columns of x and y, of a heading, or of all three"
+            )
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
     heading, speed, turn = np.array([_command(log) for log in logs]).T
     bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]

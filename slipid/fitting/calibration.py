@@ -225,7 +225,8 @@ class _Model:
         floors, sessions: names of floors and sessions.
         firmest: index of the floor to which radii refer.
         numbers: coordinates of the search vector, keyed by name.
-        unseen: names of coordinates that no run shows, and that stay at their prior means.
+        unseen: names of coordinates that no run shows, such as the track without turns, or the
+            radius without positions; they stay at their prior means.
     """
 
     space: Space
@@ -266,6 +267,14 @@ class _Model:
         unseen = {f"{what}.{f}" for f in straight for what in ("base", "centre")}
         if straight == set(floors):
             unseen |= {"offset.x", "offset.y"}
+        seen = np.isfinite(data.pose[data.fresh]).any(axis=0)
+        if not seen[0]:
+            # Headings alone show ratios of lengths, so the config's radius counts as known.
+            unseen |= {"radius", "offset.x", "offset.y", "scale", *(f"floor.{f}" for f in others)}
+        if not seen[2]:
+            unseen |= {"yaw", *(f"yaw@{s}" for s in sessions)}
+        if max(int(data.fresh[data.rows(k)].sum()) for k in range(len(data))) < 3:
+            unseen.add("lag")
         unseen &= set(numbers)
         return cls(space, floors, sessions, firmest, numbers, frozenset(unseen))
 
@@ -634,15 +643,14 @@ def _result(fit: _Fit, runs: int) -> Calibration:
     def value(names: Sequence[str], unit: str, log_of: float | None = None) -> Value:
         """Return the sum of some coordinates, or the exponential of the sum, times `log_of`."""
         w = np.array([float(name in names) for name in model.free])
-        prior = float(
-            np.hypot.reduce(
-                [model.numbers[name].std for name in names if name in model.numbers], initial=0.0
-            )
-        )
+        stds = {name: model.numbers[name].std for name in names if name in model.numbers}
+        prior = float(np.hypot.reduce([*stds.values()], initial=0.0))
+        hidden = [std for name, std in stds.items() if name in model.unseen]
         at = sum(float(model.column(name, z)) for name in names)
         influence = (off @ w) ** 2
         jackknife = (count - 1) / count * float(influence.sum())
-        std = float(np.sqrt(max(float(w @ covariance @ w), jackknife))) if w.any() else prior
+        std = float(np.sqrt(max(float(w @ covariance @ w), jackknife)))
+        std = float(np.hypot.reduce([std, *hidden])) if w.any() else prior
         share = influence / max(float(influence.sum()), 1e-300)
         freedom = max(1 / max(float((share**2).sum()), 1e-9) - 1, 3.0)
         half = std * float(student.ppf(0.95, freedom))

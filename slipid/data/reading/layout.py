@@ -140,12 +140,10 @@ class SensorLayout:
         if {"motor_torque", "wheel_torque"} & have and self.torque_constant is None:
             wanted = "expected the motor's torque per current [N m/A]"
             return f"a torque channel without torque_constant; {wanted}"
-        turned = {"pose_heading", "pose_quaternion"} & have
-        if 0 < len({"pose_x", "pose_y"} & have) + len(turned) != 3:
-            return (
-                "an incomplete pose; expected x, y and either heading or quaternion, or none of "
-                "them"
-            )
+        if len({"pose_x", "pose_y"} & have) == 1:
+            return "only one of pose_x and pose_y; expected both or neither"
+        if {"pose_heading", "pose_quaternion"} <= have:
+            return "both pose_heading and pose_quaternion; expected only one of them"
         return None
 
 
