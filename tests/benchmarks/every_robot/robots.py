@@ -230,7 +230,7 @@ ROBOTS = (
         wheel_noise=0.003,
     ),
     MadeRobot(
-        "diff_coarse_ticks",
+        "diff_coarse_ticks",  # least squares finds a lag of 0.4 rows here, and there is none
         "differential",
         (alike("floor", 0.0335, 2, 0.152),),
         0.0325,
