@@ -41,6 +41,12 @@ CASES = {
     "mecanum": ({**BOX, "shared": "no"}, CORNERS, [0] * 4, 4),
     "skid": ({**BOX, "shared": "yes"}, CORNERS, [0] * 4, 2),
     "differential": ({"track_m": "0.6"}, [(0, 0.3), (0, -0.3)], [0, 0], 2),
+    "steered": (
+        {"wheelbase_m": "0.4", "driven": "front", "encoders": "2"},
+        [(0.4, 0)] * 2,
+        [0, 0],
+        2,
+    ),
     "general": (FOUR, [(0.2, 0.1), (0.2, -0.1), (-0.3, 0)], [0, 0, 90], 3),
 }
 
@@ -86,6 +92,7 @@ def test_a_config_has_only_what_its_drive_has(drive):
         "mecanum": {"half_length_m", "half_width_m"},
         "skid": {"half_length_m", "half_width_m", "drives"},
         "differential": {"track_m"},
+        "steered": {"wheelbase_m", "driven", "encoders"},
         "general": {"wheel_places_m", "drive_directions_deg", "roller_angles_deg"},
     }
     assert set(robot) == common | own[drive]

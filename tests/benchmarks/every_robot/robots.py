@@ -124,11 +124,6 @@ class MadeRobot:
     mass: float = 10.0
 
     @property
-    def readable(self) -> bool:
-        """Whether slipid can read the config at all; it does not know steered robots yet."""
-        return self.drive != "steered"
-
-    @property
     def drives(self) -> int:
         return len(self.floors[0].radius)
 
