@@ -7,7 +7,7 @@ import numpy as np
 
 from slipid.app.config import FitSection
 from slipid.app.identify import optimised, summarised
-from slipid.app.problem import FitTask, robot_for_runs, stated_sizes
+from slipid.app.problem import FitTask, of_torques, robot_for_runs, stated_sizes
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
 from slipid.fitting.problem import fixed_viscosities
@@ -101,6 +101,7 @@ def fit_task_of(
         )
     choices += [Choice(path, fixed=_json_numbers(value)) for path, value in fixed.items()]
     choices += [Choice(path, start=_json_numbers(value)) for path, value in start.items()]
+    choices += of_torques(runs, full)
     settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)
     return FitTask(runs, full, tuple(choices), settings)
 

@@ -138,6 +138,11 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     """Return a record for each motor in a log, with its speed at the motor shaft."""
     if log.current is None:
         raise DataError(f"{log.name}: no current; expected a column for each motor")
+    if log.current_is_torque:
+        raise DataError(
+            f"{log.name}: a torque in place of the current; expected a column of each motor's "
+            "current, or torque_constant [N m/A] in the layout"
+        )
     if not log.wheels:
         raise DataError(f"{log.name}: no speed; expected the speed or angle of each motor's shaft")
     speed = log.wheel_speed

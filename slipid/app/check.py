@@ -65,7 +65,9 @@ def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
     logged = [n for n in ("current", "voltage") if getattr(task.dataset, n) is not None]
     robot = task.config.content.wheels
     absent = ["mass_kg"] if robot.mass_kg is None else []
-    absent += [] if "gear_ratio" in robot.model_fields_set else ["gear_ratio"]
+    torques = task.dataset.current_is_torque  # which are those of the wheels
+    absent += [] if torques or "gear_ratio" in robot.model_fields_set else ["gear_ratio"]
+    logged = ["torque"] if torques else logged
     if not logged or not absent:
         return
     taken = {"mass_kg": f"{float(task.robot.body.mass):g} kg", "gear_ratio": "1"}
@@ -242,7 +244,7 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
 
     This information depends on the parameters and the noise, which are not known before a fit. It
     is computed as after a fit, at plausible values of the parameters: those from which a fit
-    starts, and draws of the prior. Each is combined with two sizes of the noise: that of the runs'
+    starts, and draws of the prior. They are combined with two sizes of the noise: that of the runs'
     scatter before any physics explains it, and the typical one with which a fit begins.
     """
     space, w = problem.space, problem.windows
@@ -254,8 +256,8 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
     ratios: dict[str, ExpectedEstimate] = {}
     open_: tuple[FlatDirection, ...] = ()
     most = -np.inf
-    for z in _plausible(space):
-        for covariance in problem.laplaces(z, noises, keep):
+    for z, levels in _plausible(space, noises):
+        for covariance in problem.laplaces(z, levels, keep):
             flat = flat_directions(space, covariance, *where)
             found = estimates(space, task.choices, z, covariance, volt, members(flat))
             _widened(parameters, found)
@@ -269,17 +271,23 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
 
 
 _DRAWS = 3
-"""Number of draws of the prior at which the information is computed, each with its mirror image."""
+"""Number of draws of the prior, each of them used together with its mirror image."""
 
 
-def _plausible(space: Space) -> Iterator[Search]:
-    """Yield values of the parameters: those from which a fit starts, and draws of their prior."""
+def _plausible(
+    space: Space, noises: Sequence[np.ndarray]
+) -> Iterator[tuple[Search, Sequence[np.ndarray]]]:
+    """Yield plausible values of the parameters, and the sizes of the noise to combine them with.
+
+    The values are those from which a fit starts, with both sizes of the noise, and draws of the
+    prior, with the larger one.
+    """
     creep = space.where(lambda e: e.quantity == "surface.creep")
     for value in CREEPS if creep.any() else CREEPS[:1]:
-        yield np.where(creep, np.log(value), space.start)
+        yield np.where(creep, np.log(value), space.start), noises
     for step in np.random.default_rng(0).standard_normal((_DRAWS, space.size)):
-        yield space.prior_mean + step * space.prior_std
-        yield space.prior_mean - step * space.prior_std
+        yield space.prior_mean + step * space.prior_std, noises[:1]
+        yield space.prior_mean - step * space.prior_std, noises[:1]
 
 
 def _widened(kept: dict[str, ExpectedEstimate], found: Iterable[Estimate]) -> None:

@@ -299,7 +299,7 @@ def fit_task(
     known = [*lag, *without_rollers(shape), *fixed_viscosities(dataset)]
     trusted = config.content.fit.lengths_from
     # The choices of the config come last, since later choices override earlier ones.
-    choices = [*known, *choices]
+    choices = [*known, *choices, *of_torques(dataset, robot)]
     if trusted is not None and {*FREE_LENGTH.values()} <= {
         e.path for e in Space(robot, choices).free
     }:
@@ -340,6 +340,21 @@ def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
     return [
         Choice(path, prior_mean=mean, prior_std=SIZE_STD * mean, free=path == FREE_LENGTH[trusted])
         for path, mean in nominal.items()
+    ]
+
+
+def of_torques(runs: Runs, robot: Robot) -> list[Choice]:
+    """Return choices that hold the electric parameters fixed if the runs have torques.
+
+    The motor is then one whose torque at the wheel [N m] is equal to its current.
+    """
+    if not runs.current_is_torque:
+        return []
+    values = {"back_emf": 1.0 / float(robot.motor.gear_ratio), "efficiency": 1.0}
+    held = ("resistance", "inductance", "brush_drop")
+    return [
+        *(Choice(f"motor.{name}", fixed=value) for name, value in values.items()),
+        *(Choice(f"motor.{name}", free=False) for name in held),
     ]
 
 

@@ -49,10 +49,13 @@ class Log:
         wheel_speed: reported speed of each wheel [rad/s], or None.
         wheel_speed_command: commanded speed of each wheel [rad/s], or None.
         twist_command: commanded x [m/s], y [m/s] and yaw rate [rad/s], or None.
-        current: current of each motor [A], or None.
+        current: current of each motor [A], or None; torque of each drive at the wheel [N m] if
+            `current_is_torque`.
         current_fresh: False where a current repeats the last reading; None if every row has new
             currents.
         current_is_signed: False if the log has only magnitudes of currents.
+        current_is_torque: True if the log has torques, with no torque constant by which they could
+            be currents; it then has no voltages.
         voltage: voltage across each motor [V], or None.
         voltage_fresh: False where a voltage repeats the last reading; None if every row has new
             voltages.
@@ -82,6 +85,7 @@ class Log:
     current: Float[np.ndarray, "time wheel"] | None = None
     current_fresh: Bool[np.ndarray, "time wheel"] | None = None
     current_is_signed: bool
+    current_is_torque: bool = False
     voltage: Float[np.ndarray, "time wheel"] | None = None
     voltage_fresh: Bool[np.ndarray, "time wheel"] | None = None
     duty: Float[np.ndarray, "time wheel"] | None = None

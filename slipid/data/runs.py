@@ -39,6 +39,7 @@ class Runs:
         current_fresh: False where a current repeats the last reading (sample, wheel), or None.
         voltage_fresh: False where a voltage repeats the last reading (sample, wheel), or None.
         current_is_signed: False if some log has only magnitudes of currents.
+        current_is_torque: True if `current` has torques at the wheels [N m].
         session: name of each run's session; within a session the camera's marker was not moved on
             the robot.
         heading: commanded direction of travel of each run [rad]; nan if the robot turns on the spot
@@ -61,6 +62,7 @@ class Runs:
     current_fresh: Bool[np.ndarray, "sample wheel"] | None
     voltage_fresh: Bool[np.ndarray, "sample wheel"] | None
     current_is_signed: bool
+    current_is_torque: bool
     session: tuple[str, ...]
     heading: Float[np.ndarray, " run"]
     speed: Float[np.ndarray, " run"]
@@ -137,7 +139,8 @@ def collect(
         aside: one line about each run that was left out because its poses are unusable.
 
     Raises:
-        DataError: there is no run, the numbers of wheels differ, or a run has no poses.
+        DataError: there is no run, the numbers of wheels differ, only some runs have torques, or a
+            run has no poses.
     """
     if not logs:
         raise DataError("no runs; expected at least one log")
@@ -145,6 +148,11 @@ def collect(
         if log.wheels != logs[0].wheels:
             raise DataError(
                 f"{log.name}: {log.wheels} wheels; expected {logs[0].wheels}, as in {logs[0].name}"
+            )
+        if log.current_is_torque != logs[0].current_is_torque:
+            raise DataError(
+                f"{log.name} and {logs[0].name}: one has torques and the other has none; expected "
+                "torques in all runs, or torque_constant [N m/A] in the layout of the torques"
             )
         if log.pose is None:
             raise DataError(f"{log.name}: no pose; expected pose columns, which a fit needs")
@@ -182,6 +190,7 @@ def collect(
         current_fresh=_fresh(logs, "current"),
         voltage_fresh=_fresh(logs, "voltage"),
         current_is_signed=all(log.current_is_signed for log in logs),
+        current_is_torque=logs[0].current_is_torque,
         session=tuple(session or (default_session(log) for log in logs)),
         heading=heading,
         speed=speed,

@@ -28,7 +28,7 @@ Robotics and Automation 12(6).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Literal
@@ -53,6 +53,8 @@ from slipid.fitting.innovations import (
 )
 from slipid.model.geometry import Geometry
 from slipid.model.kinematics import Kinematics, Steering, is_axle, nominal_base
+from slipid.model.robot import Robot
+from slipid.parameter import as_numbers
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 
@@ -117,15 +119,6 @@ class Value:
     verdict: Verdict
     unit: str
 
-    def to_json(self) -> Content:
-        return {
-            "value": self.value,
-            "interval90": list(self.interval90),
-            "std": self.std,
-            "verdict": self.verdict,
-            "unit": self.unit,
-        }
-
 
 @dataclass(frozen=True)
 class MotionNoise:
@@ -151,7 +144,6 @@ class Calibration:
     """Calibrated kinematics and pose sensor of a robot.
 
     Attributes:
-        kinematics: kinematics on each floor, at the estimates.
         sideways: True if the wheels determine the twist, so that `base` is an effective base.
         radius: effective rolling radius of every drive, keyed by floor [m].
         base: effective track or base, keyed by floor [m].
@@ -159,7 +151,7 @@ class Calibration:
             that have none.
         offset: place of the pose sensor ahead of and to the left of the robot's middle [m].
         yaw: heading of the pose sensor less that of the robot [rad].
-        session_yaw: deviations of the sensor's heading in each session [rad].
+        session_yaw: deviation of the sensor's heading in each session [rad].
         lag: lag of the poses behind the wheels [s].
         scale: true over logged length [1].
         firmest: floor with the largest radius, to which the centre and other radii refer.
@@ -169,7 +161,6 @@ class Calibration:
         runs: number of calibrated runs.
     """
 
-    kinematics: Kinematics
     sideways: bool
     radius: Mapping[str, tuple[Value, ...]]
     base: Mapping[str, Value]
@@ -185,6 +176,79 @@ class Calibration:
     nominal_base: float
     noise: MotionNoise
     runs: int
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """One line for each floor, and one for the pose sensor, for people."""
+        lines = []
+        for floor, radii in self.radius.items():
+            names = (
+                ["left", "right"] if len(radii) == 2 else [str(j + 1) for j in range(len(radii))]
+            )
+            names, radii = (["mean"], radii[:1]) if self.steering else (names, radii)
+            each = ", ".join(f"{n} {_mm(v)}" for n, v in zip(names, radii, strict=True))
+            what = "base" if self.sideways else "wheelbase" if self.steering else "track"
+            ratio = self.multipliers[floor][1]
+            line = f"{floor}: wheel radius {each}; effective {what} {_mm(self.base[floor])}"
+            line += f", {ratio:.3f} of nominal"
+            if floor in self.centre and self.centre[floor].verdict != "fixed":
+                line += f"; turns about a point {_mm(self.centre[floor])} ahead of the middle"
+            lines.append(line)
+        if self.steering:
+            lines.append(self._of_steering())
+        x, y = self.offset
+        lines.append(
+            f"pose sensor {_mm(x)} ahead and {_mm(y)} left of the middle, turned by "
+            f"{np.degrees(self.yaw.value):.2f} deg; poses are {1e3 * self.lag.value:.0f} ms late"
+        )
+        return tuple(lines)
+
+    def _of_steering(self) -> str:
+        """Return a line about the steering, which says what only priors tell."""
+        zero, gain, understeer = (self.steering[n] for n in ("zero_rad", "gain", "understeer"))
+        line = (
+            f"steering: straight ahead at {np.degrees(zero.value):.2f} deg, gain {gain.value:.3f}, "
+            f"understeer {understeer.value:.4f} s^2/m"
+        )
+        if gain.verdict != "identified" or self.base[self.firmest].verdict != "identified":
+            ratio = gain.value / self.base[self.firmest].value
+            line += (
+                f"; of gain and wheelbase the runs tell little but their ratio, {ratio:.3f} per m"
+                ": drive curves at large steering angles"
+            )
+        if understeer.verdict == "not_identified":
+            line += "; understeer is not identified: drive the same curves slowly and fast"
+        return line
+
+    def numbers(self, floor: str) -> Float[np.ndarray, " number"]:
+        """Return log radius ratios of the drives, log base ratio, and centre [m] on a floor.
+
+        Ratios are to the config's lengths.
+
+        Raises:
+            ValueError: the floor was not calibrated.
+        """
+        if floor not in self.radius:
+            raise ValueError(f"no surface '{floor}'; calibrated: {', '.join(self.radius)}")
+        radius = [np.log(v.value / self.nominal_radius) for v in self.radius[floor]]
+        centre = self.centre[floor].value if floor in self.centre else 0.0
+        return np.array([*radius, np.log(self.base[floor].value / self.nominal_base), centre])
+
+    def seen(self, robot: Robot) -> Robot:
+        """Return a robot whose poses are measured by the calibrated pose sensor."""
+        deviations = [self.session_yaw.get(s, 0.0) for s in robot.camera.sessions]
+        camera = replace(
+            robot.camera,
+            scale=as_numbers(self.scale.value),
+            lag=as_numbers(self.lag.value),
+            marker_yaw=as_numbers(self.yaw.value),
+            session_yaw=as_numbers(np.array(deviations)),
+            marker_place=as_numbers([v.value for v in self.offset]),
+        )
+        return replace(robot, camera=camera)
 
     @property
     def multipliers(self) -> dict[str, tuple[tuple[float, ...], float]]:
@@ -202,29 +266,77 @@ class Calibration:
         }
 
     def to_json(self) -> Content:
-        """Return the section `calibration` of identified.json."""
+        """Return the section `calibration` of identified.json, which `of_json` reads."""
         has_track = not self.sideways and not self.steering
         length = "effective_track_m" if has_track else "effective_base_m"
-        steering = {name: value.to_json() for name, value in self.steering.items()}
+        steering = {name: asdict(value) for name, value in self.steering.items()}
         return {
             "surfaces": {
                 floor: {
-                    "rolling_radius_m": [v.to_json() for v in self.radius[floor]],
-                    length: self.base[floor].to_json(),
+                    "rolling_radius_m": [asdict(v) for v in self.radius[floor]],
+                    length: asdict(self.base[floor]),
                 }
                 for floor in self.radius
             },
-            "centre_of_rotation_m": {floor: v.to_json() for floor, v in self.centre.items()},
-            "pose_offset_m": [v.to_json() for v in self.offset],
-            "pose_yaw_rad": self.yaw.to_json(),
-            "pose_lag_s": self.lag.to_json(),
-            "pose_scale": self.scale.to_json(),
+            "centre_of_rotation_m": {floor: asdict(v) for floor, v in self.centre.items()},
+            "pose_offset_m": [asdict(v) for v in self.offset],
+            "pose_yaw_rad": asdict(self.yaw),
+            "pose_session_yaw_rad": dict(self.session_yaw),
+            "pose_lag_s": asdict(self.lag),
+            "pose_scale": asdict(self.scale),
             **({"steering": steering} if steering else {}),
             "multipliers": {
                 floor: {"wheel_radius": list(radius), "track": base}
                 for floor, (radius, base) in self.multipliers.items()
             },
+            "nominal": {"wheel_radius_m": self.nominal_radius, length[10:]: self.nominal_base},
+            "firmest": self.firmest,
+            "noise": asdict(self.noise),
+            "runs": self.runs,
         }
+
+    @classmethod
+    def of_json(cls, content: Content) -> "Calibration":
+        """Return the calibration of a section `calibration`."""
+
+        def value(x: Content) -> Value:
+            return Value(**{**x, "interval90": tuple(x["interval90"])})
+
+        def stds(x: Content) -> dict[str, tuple[float, float, float]]:
+            return {floor: (a, b, c) for floor, (a, b, c) in x.items()}
+
+        floors, noise = content["surfaces"], content["noise"]
+        steering = content.get("steering", {})
+        length = "base_m" if "base_m" in content["nominal"] else "track_m"
+        x, y = content["pose_offset_m"]
+        return cls(
+            sideways=length == "base_m" and not steering,
+            radius={f: tuple(value(v) for v in of["rolling_radius_m"]) for f, of in floors.items()},
+            base={f: value(of[f"effective_{length}"]) for f, of in floors.items()},
+            centre={f: value(v) for f, v in content["centre_of_rotation_m"].items()},
+            offset=(value(x), value(y)),
+            yaw=value(content["pose_yaw_rad"]),
+            session_yaw=content["pose_session_yaw_rad"],
+            lag=value(content["pose_lag_s"]),
+            scale=value(content["pose_scale"]),
+            firmest=content["firmest"],
+            steering={name: value(v) for name, v in steering.items()},
+            nominal_radius=content["nominal"]["wheel_radius_m"],
+            nominal_base=content["nominal"][length],
+            noise=MotionNoise(
+                noise["place"], noise["heading"], stds(noise["process"]), stds(noise["effect"])
+            ),
+            runs=content["runs"],
+        )
+
+
+def _mm(length: Value) -> str:
+    """Return a length in mm with half the width of its interval, or the reason why it has none."""
+    half = 0.5 * (length.interval90[1] - length.interval90[0])
+    text = f"{1e3 * length.value:.4g} mm"
+    if length.verdict == "not_identified":
+        return f"{text} (not identified)"
+    return text if length.verdict == "fixed" else f"{text} +- {1e3 * half:.2g}"
 
 
 def _base_names(floor: str) -> tuple[str, ...]:
@@ -736,7 +848,6 @@ def _result(fit: _Fit, runs: int) -> Calibration:
         "understeer": value(["understeer"], "s^2/m"),
     }
     return Calibration(
-        kinematics=model.kinematics(z),
         sideways=shape.determines_twist,
         radius={
             f: tuple(value(_radius_names(f, j), "m", radius) for j in range(shape.drives))

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import brentq
-from scipy.stats import f as fisher
+from scipy.special import fdtri
 
 from slipid.fitting.session_effects import remaining_effects
 from slipid.fitting.shared_effects import AXES, SharedEffects
@@ -184,7 +184,7 @@ def _variance_growth(
     def excess(log_growth: float) -> float:
         v = own + np.exp(log_growth) * (spread - own)
         square = along**2 / v[:, 0] + across**2 / (v[:, 1] + 0.25 * d**2 * v[:, 2])
-        return float(np.quantile(square, 0.9) - 2 * fisher.ppf(0.9, 2, DEGREES))
+        return float(np.quantile(square, 0.9) - 2 * fdtri(2, DEGREES, 0.9))
 
     most = np.log(_MOST_GROWTH)
     if excess(0.0) <= 0:

@@ -122,7 +122,7 @@ def matrices(
     `base_ratio` is the effective base over that of the geometry; lengths are in metres.
     """
     out = rolling * radius[..., None, :]
-    out[..., 2, :] /= base_ratio[..., None]
+    out[..., 2, :] /= np.asarray(base_ratio)[..., None]
     out[..., 1, :] -= centre[..., None] * out[..., 2, :]
     return np.asarray(out)
 

@@ -7,11 +7,13 @@ With (s, 0, d) the body twist J^+ r w of wheels that do not slip, s ahead [m/s] 
     effective_track         v_x = a s            yaw = b d            v_y = -x yaw
     instantaneous_centres   v_x = a s + c d      yaw = b d + e s      v_y = -x yaw
     full_linear             v_x = a s + c d      yaw = b d + e s      v_y = f s - x yaw
+    calibrated              kinematics with a radius for every drive, see `slipid.model.kinematics`
 
 a is the size of the wheels, and a / b the track, relative to the geometry; x is the position on the
 longitudinal axis about which the robot turns [m]; c and e describe a robot whose sides differ. All
-models but `encoder` are for wheels that do not determine motion sideways (skid steer and
-differential drives): on other robots v_y is not -x yaw. None of these models has settings.
+models but `encoder` and `calibrated` are for wheels that do not determine motion sideways (skid
+steer and differential drives): on other robots v_y is not -x yaw. None of these models has
+settings.
 
 Liberties:
     - The five coefficients of the instantaneous centres are equivalent to those of Mandow et al.,
@@ -59,6 +61,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.model.geometry import Geometry
+from slipid.model.kinematics import matrices
 from slipid.predict.slip_model import Channel, RobotSpec, Twists, turned
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
@@ -139,6 +142,59 @@ def corrected(rolling: Twists, numbers: Float[np.ndarray, " number"]) -> Twists:
     s, d = rolling[:, 0], rolling[:, 2]
     yaw = b * d + e * s
     return np.stack([a * s + c * d, f * s - x * yaw, yaw], axis=-1)
+
+
+CALIBRATED_STDS = (0.3, 0.05, 0.5, 0.3)
+"""Prior stds of log radius ratios, of their deviations from their mean, of log base ratios [1], and
+of the centre of rotation [m]."""
+
+
+@final
+@dataclass(frozen=True)
+class Calibrated(TwistModel):
+    """Calibrated kinematics: effective radius of every drive, track or base, centre of rotation.
+
+    The coefficients are those of `slipid.fitting.calibration.Calibration.numbers`: log radius
+    ratios of the drives, log base ratio, and centre [m]. `learn` estimates them for one floor from
+    windows of body poses, so that pose sensor and lag are taken as known.
+
+    Attributes:
+        shape: geometry to which the ratios refer, None for the robot's own.
+    """
+
+    name: str = "calibrated"
+    shape: Geometry | None = None
+
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "Calibrated":
+        from scipy.optimize import least_squares
+
+        drives = w.steps.signals.turn.shape[1]
+        radius, deviation, *others = CALIBRATED_STDS
+        free = drives + 1 if spec.determines_twist else drives + 2
+
+        def model(z: np.ndarray) -> "Calibrated":
+            return replace(self, coefficients=np.pad(z, (0, drives + 2 - free)))
+
+        def errors(z: np.ndarray, noise: float) -> np.ndarray:
+            """Return errors of displacements [m], and of the prior in units of their noise."""
+            own, rest = z[:drives], z[drives:]
+            prior = [own / radius, (own - own.mean()) / deviation, rest / others[: len(rest)]]
+            found = w.errors(model(z).twist(w.steps, spec), spec)
+            return np.concatenate([found, noise * np.concatenate(prior)])
+
+        z, noise = np.zeros(free), 1e-4
+        for _ in range(2):  # the second time with the noise that the first one has left
+            z = least_squares(errors, z, args=(noise,)).x
+            noise = float(np.sqrt(np.mean(errors(z, 0.0) ** 2)))
+        return model(z)
+
+    def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
+        own = spec if self.shape is None else spec.of_shape(self.shape)
+        *radius, base, centre = self.known
+        matrix = matrices(
+            own.back, own.wheel_radius * np.exp(radius), np.exp(base), np.asarray(centre)
+        )
+        return np.asarray(steps.signals.speed @ matrix.T)
 
 
 HARMONICS = 6

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import f as fisher
+from scipy.special import fdtr
 
 from slipid.fitting.variances import DEGREES
 
@@ -111,7 +111,7 @@ def forecast(
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(500, 2))
     if np.isfinite(freedom):
-        level = fisher.cdf(q / 2, 2, freedom)
+        level = fdtr(2, freedom, q / 2)
         normal /= np.sqrt(rng.chisquare(freedom, (500, 1)) / freedom)
     else:
         level = -np.expm1(-q / 2)

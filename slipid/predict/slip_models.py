@@ -13,7 +13,15 @@ from slipid.data.windows import Windows
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.predict.curves import CurveModel, Saturating, above, powers, ramps, soft_torque
-from slipid.predict.kinematics import TERMS, Corrected, Encoder, HeadingLookup, Together, nominal
+from slipid.predict.kinematics import (
+    TERMS,
+    Calibrated,
+    Corrected,
+    Encoder,
+    HeadingLookup,
+    Together,
+    nominal,
+)
 from slipid.predict.slip_model import (
     Increments,
     PredictedRun,
@@ -164,6 +172,7 @@ def slip_models(
             a group together.
     """
     models: list[TwistModel] = [nominal(shape), Encoder()]
+    models.append(Calibrated(shape=shape))
     if shape.determines_twist:
         models += _of_wheels(has_current, together)
     else:
@@ -173,9 +182,9 @@ def slip_models(
 
 def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]:
     """Return models for wheels that determine the twist: slip curves, and a table of headings."""
-    out: list[TwistModel] = [CurveModel("constant", powers(0))]
+    out: list[TwistModel] = []
     if has_current:
-        out += [
+        out = [
             CurveModel("linear", powers(1), soft_torque),
             CurveModel("affine", powers(0, 1), soft_torque),
             CurveModel("svr", powers(0, 1), soft_torque, insensitive=True),

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
-from slipid.infer.bench.verdict import BenchFit
 from slipid.report.page import Page, percent, table, verdict
 from slipid.support.content import Content
 
 if TYPE_CHECKING:
+    from slipid.infer.bench.verdict import BenchFit
     from slipid.infer.posterior.diagnosis import Posterior
     from slipid.infer.result import Fit
     from slipid.infer.verdicts.disputed import Trust
@@ -296,7 +296,7 @@ def show_selftest(page: Page, found: Content) -> None:
         page.line(f"NOT recovered: {', '.join(found['failed'])}")
 
 
-def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
+def show_bench(page: Page, fit: "BenchFit", taken: Sequence[str] = ()) -> None:
     """Write the fitted parameters of motors on a bench, warnings, and how the fits ended.
 
     `taken` has sentences about the columns of the log that were used.

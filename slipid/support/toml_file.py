@@ -69,7 +69,7 @@ def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
 def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) -> str:
     """Return a line about one mistake: file, key, what was found and what was expected."""
     kind, given, context = error["type"], error["input"], error.get("ctx", {})
-    steps = _steps(mapping, error["loc"])
+    steps = _steps(mapping, error["loc"], kind in ("missing", "missing_argument"))
     where = f"{path}: {_spelled(steps)}" if steps else str(path)
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         known = list(_annotations(_kinds_at(mapping, root, steps[:-1])[0]))
@@ -93,10 +93,11 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
     return f"{where}: {given!r}; expected: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 
-def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
+def _steps(mapping: object, loc: Sequence[Step], missing: bool) -> list[Step]:
     """Return the steps to a mistake in the file, from the location that pydantic reports.
 
-    Pydantic's location also has names of union members, which are omitted.
+    Pydantic's location also has names of union members, which are omitted. If a key is `missing`,
+    it is the last step, although the file does not have it.
     """
     steps: list[Step] = []
     here = mapping
@@ -105,7 +106,7 @@ def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
             isinstance(here, list) and isinstance(part, int) and part < len(here)
         ):
             here = _below(here, part)
-        elif k < len(loc) - 1 or not isinstance(here, dict):
+        elif not missing or k < len(loc) - 1 or not isinstance(here, dict):
             continue
         steps.append(part)
     return steps

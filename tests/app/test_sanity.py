@@ -11,6 +11,7 @@ from slipid.app.config import FitSection, read_config
 from slipid.app.identify import identify
 from slipid.app.problem import FitTask, read_fit_task
 from slipid.model.robot import Robot
+from slipid.search_space import Space
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers.plain_config import ROBOT, config
@@ -78,3 +79,19 @@ def test_magnitudes_beside_voltages_are_refused_where_wheels_drag_each_other(
     robot = Robot.of(SKID.geometry, 50.0)
     found = sanity(FitTask(runs, robot, (), FitSection()))
     assert [f.kind for f in found].count("braking_unseen") == expected
+
+
+def test_torques_of_joints_need_no_gear_and_hold_electric_parameters_fixed(tmp_path):
+    robot = ROBOT.replace(f"gear_ratio = {GEAR}\n", "")
+    file = config(tmp_path, robot)
+    assert "forgotten" in kinds(file)
+    text = file.read_text().replace("columns.current]", "columns.wheel_torque]")
+    prior = '"motor.back_emf" = { prior = { mean = 0.05, std = 0.02 } }'
+    text = text.replace('unit = "A"', 'unit = "N*m"') + f"[parameters]\n{prior}\n"
+    file.write_text(text)
+    assert "forgotten" not in kinds(file)
+    job = read_fit_task(read_config(file), tmp_path / "logs", Reporter(quiet=True))
+    space = Space(job.robot, job.choices)
+    electric = {"resistance", "back_emf", "efficiency", "inductance", "brush_drop"}
+    assert not electric & {e.path.removeprefix("motor.") for e in space.free}
+    assert float(space.template.motor.gain) == pytest.approx(1.0)

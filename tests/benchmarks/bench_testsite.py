@@ -23,8 +23,8 @@ from slipid.app.problem import read_fit_task
 from slipid.data.floor_map import FloorMap, four_zones, patchwork
 from slipid.lab.testsite.config import plan
 from slipid.lab.testsite.driving import SiteRun, TimedTwists, drive, straight
+from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.plant import SimulatedRobot
-from slipid.lab.testsite.robot_build import RobotBuild
 from slipid.lab.testsite.sections import HeadingRuns, PaperGridRuns, RectangleRuns, WanderRuns
 from slipid.lab.testsite.simulate import log_of, simulate, truth
 from slipid.lab.testsite.site import Site
@@ -282,7 +282,7 @@ def test_what_biases_load_shares() -> None:
 
 def test_currents_on_mixed_surfaces() -> None:
     """Wheels of a pair on two surfaces: does each draw the current of the floor beneath it?"""
-    robot = replace(RobotBuild(), centres_m={"as_built": (0.0, 0.0)})
+    robot = replace(OmniBuild(), centres_m={"as_built": (0.0, 0.0)})
     site = Site(robot=robot)
     seeds = range(quick(6, 2))
 
@@ -481,7 +481,7 @@ def _points(logs: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _by_heading(ax, logs: list, colour: str, label: str) -> np.ndarray:
     """Draw the slip of the body against the direction of travel of every run; the slips."""
-    back = np.linalg.pinv(RobotBuild().wheel_from_twist)
+    back = np.linalg.pinv(OmniBuild().wheel_from_twist)
     way, slip = [], []
     for log in logs:
         far = back @ log.wheel_angle[-1]

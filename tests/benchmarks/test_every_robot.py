@@ -140,7 +140,7 @@ def test_true_numbers_predict_what_noiseless_sensors_log(name, tmp_path):
     assert min(worse.values()) > 10 * PERFECT
 
 
-def test_intervals_in_identified_json_are_judged():
+def test_calibration_in_identified_json_is_judged():
     robot = NAMED["diff_own"]
 
     def number(value, error=0.0):
@@ -154,9 +154,16 @@ def test_intervals_in_identified_json_are_judged():
             }
             for floor in robot.floors
         },
+        "centre_of_rotation_m": {},
+        "nominal": {"wheel_radius_m": 0.0762, "track_m": 0.46},
         "pose_offset_m": [number(0.060), number(0.010)],
+        "pose_yaw_rad": number(0.0),
         "pose_lag_s": number(0.040, 0.0002),
     }
     found = fits.covered(robot, calibration)
     assert len(found) == 9
     assert {name for name, held in found.items() if not held} == {"base tile", "lag"}
+    k = fits.kinematics(calibration)
+    np.testing.assert_allclose(k.radius["carpet"], robot.floor("carpet").radius)
+    assert k.base == {"carpet": 0.448, "tile": 0.449}
+    assert (k.place, k.lag) == ((0.060, 0.010), 0.0402)

@@ -8,13 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slipid.app.bench import records_of
 from slipid.app.bench_priors import bench_priors
 from slipid.app.config import parsed
 from slipid.data.reading.column_names import meaning_of
+from slipid.data.reading.layout import SensorLayout
 from slipid.data.reading.motor_layout import given_columns, motor_layout
 from slipid.data.reading.table_format import format_of
 from slipid.support.errors import DataError
 from tests.helpers import made_bench as made
+from tests.helpers import resting
 from tests.helpers.shared import invoke
 
 CONFIG = """
@@ -345,3 +348,9 @@ def test_real_logs_without_voltage(real_data):
         assert found["parameters"][f"motor.resistance@{label}"]["verdict"] == "not_identified"
         assert found["parameters"][f"motor.back_emf@{label}"]["verdict"] == "not_identified"
     assert any("log the motor voltage" in text for text in found["messages"])
+
+
+def test_a_torque_is_no_current_of_a_motor_on_a_bench():
+    log = replace(resting.runs().logs[0], current_is_torque=True)
+    with pytest.raises(DataError, match=r"run00.csv: a torque in place of the current"):
+        records_of(log, SensorLayout())

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 import slipid as sl
+from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fitting import likelihood as lk
 from slipid.model.motor import sign_of_motion
+from slipid.support.errors import DataError
 from tests.helpers import resting
 
 
@@ -66,3 +68,21 @@ def test_windows_at_rest_say_nothing_of_friction():
     moved = np.abs(amps(2.0) - amps(1.0))
     assert moved[still].max() < 1e-6
     assert moved[~still].max() > 0.01
+
+
+@pytest.mark.slow
+def test_torques_tell_friction_and_nothing_electric():
+    fit = sl.fit(resting.torques(), resting.robot(), quiet=True)
+    assert fit.converged
+    for name in ("resistance", "back_emf", "inductance", "brush_drop", "efficiency"):
+        assert fit.parameters[f"motor.{name}"].verdict == "fixed"
+    for path in ("motor.coulomb_friction", "motor.viscous_friction"):
+        low, high = fit.parameters[path].interval90
+        assert low < resting.TRUTH[path] < high, (path, low, high)
+    assert "voltage" not in str(fit)
+
+
+def test_torques_do_not_go_with_currents():
+    one, other = resting.torques().logs[0], resting.runs(voltage=False).logs[1]
+    with pytest.raises(DataError, match=r"run01.csv and run00.csv: .* torque_constant"):
+        collect([one, other])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.infer.bench.motor import BenchRecord
-from slipid.lab.testsite.robot_build import MotorBuild, SpeedLoop, WheelDrives
+from slipid.lab.testsite.motors import MotorBuild, SpeedLoop, WheelDrives
 
 FLYWHEEL, ROTOR = 1e-4, 7.1e-6
 STEPS = (0, 6, 0, -6, 12, 3, -12, -3, 0, 18, 9, -18, 8, -8, 0)

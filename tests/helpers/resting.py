@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,15 @@ def runs(signed: bool = True, voltage: bool = True) -> Runs:
     rng = np.random.default_rng(0)
     drives = [(v * d, w) for v in (0.15, 0.45) for d in (1, -1) for w in (0.0, 0.0, 0.4, -0.4)]
     return collect([_log(k, v, w, signed, voltage, rng) for k, (v, w) in enumerate(drives)])
+
+
+def torques() -> Runs:
+    """The same runs, with the torque of every joint [N m] in place of currents and voltages."""
+    logs = []
+    for log in runs(voltage=False).logs:
+        torque = log.current * GEAR * EFFICIENCY * BACK_EMF
+        logs.append(replace(log, current=torque, current_is_torque=True))
+    return collect(logs)
 
 
 def _log(

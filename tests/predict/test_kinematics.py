@@ -133,7 +133,8 @@ def test_corrections_come_back_from_their_names_and_numbers():
     shape = SHAPES["differential"]
     w = driven(shape, windows(shape), with_truth(shape, "full_linear"))
     fitted = [model.fit(w, robot(shape)) for model in slip_models(shape, has_current=True)]
-    names = ["nominal", "encoder", "effective_track", "instantaneous_centres", "full_linear"]
+    names = ["nominal", "encoder", "calibrated"]
+    names += ["effective_track", "instantaneous_centres", "full_linear"]
     assert [model.name for model in fitted] == names
     states = {r.name: {f: v.tolist() for f, v in r.state.items()} for r in fitted}
     for one, two in zip(fitted, restored(shape, states), strict=True):

@@ -18,7 +18,7 @@ ROBOT = made_robot(sessions=("one",))
 ALL = {model.name: model for model in slip_models(ROBOT.geometry, has_current=True)}
 SPLINE = np.array([0.02, 0.01, 0.05, 0.1, 0.0, 0.2, 0.1])
 TRUE = {
-    "constant": ([0.1], [0.4]),
+    "calibrated": ([-0.1, -0.12, -0.08, 0.05, 0.0], [-0.5, -0.45, -0.55, -0.1, 0.0]),
     "linear": ([1.0], [4.0]),
     "affine": ([0.03, 1.5], [0.1, 3.0]),
     "quadratic": ([0.02, 2.0, -3.0], [0.0, 5.0, -6.0]),
@@ -179,7 +179,7 @@ def test_models_come_back_from_their_names_and_numbers():
 
 def test_without_currents_only_models_that_need_none_are_there():
     names = [r.name for r in slip_models(ROBOT.geometry, has_current=False)]
-    assert names == ["nominal", "encoder", "constant", "heading_lookup"]
+    assert names == ["nominal", "encoder", "calibrated", "heading_lookup"]
 
 
 @pytest.mark.parametrize("name", ["affine", "saturating", "heading_lookup"])

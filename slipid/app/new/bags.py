@@ -1,5 +1,6 @@
 """Proposal of a config for bags, from the types and names of their topics."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,7 +16,7 @@ from slipid.data.reading.bag.topics import Topic, topics_of
 from slipid.data.reading.column_names import meaning_of
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, TURNS, Layout
 
-SUFFIXES = (".bag", ".db3", ".mcap")
+SUFFIXES = (".bag", ".db3", ".mcap", ".ulg")
 _METADATA = "metadata.yaml"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -27,6 +28,7 @@ _TOPICS_HELP = (
     "The topic of each channel. Known types of messages need neither field nor unit; the frame of "
     "a pose in /tf and the meaning of the effort of joints must be given."
 )
+_NUMBER = re.compile(r"std_msgs/msg/(U?Int|Float)(\d+)")
 _BY_NAME = ("current", "voltage", "duty")
 """Channels that are recognised by the names of fields in messages of unknown types."""
 
@@ -42,6 +44,7 @@ class _TopicChannel:
             robot.
         question: open question for the user; empty if there is none.
         field, unit: field and unit of the numbers; empty if the message type implies them.
+        beside: topics of the other wheels, if each wheel has a topic of its own.
     """
 
     channel: str
@@ -50,11 +53,19 @@ class _TopicChannel:
     question: str = ""
     field: str = ""
     unit: str = ""
+    beside: tuple[Topic, ...] = ()
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Return all topics of the channel, in the order of the wheels."""
+        return (self.topic, *self.beside)
 
     def line(self) -> ConfigLine:
         """Return the config line of the channel; it is commented out if the field is an effort."""
         topic = self.topic
         inside = f"topic = {toml(topic.name)}"
+        if self.beside:
+            inside = f"topics = {toml([one.name for one in self.topics])}"
         if self.field:
             inside += f", field = {toml(self.field)}, unit = {toml(self.unit)}"
         if topic.type == _TRANSFORMS and topic.frames:
@@ -92,6 +103,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     topics = topics_of(bag)
     joints, doubt = _joints(topics)
     channels = list(_best_topics(topics, len(joints)))
+    channels += _by_topic_names(topics, channels)
     wheels = next((one.wheels for name in TURNS for one in channels if one.channel == name), 0)
     channels += _by_field_names(topics, channels, wheels)
     robot, hints = guess_robot(options, wheels, ())
@@ -116,7 +128,9 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     floor = "on which floor was it driven? A topic or table can give it: runs, in the layout"
     glob = common_glob(inside)
     sentences = [f"{bag}: {len(topics)} topics"]
-    sentences += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in channels]
+    for one in channels:
+        names = ", ".join(topic.name for topic in one.topics)
+        sentences.append(f"  {names} ({one.topic.type}): {one.channel}")
     return ConfigDraft(
         robot,
         (layout,),
@@ -161,7 +175,7 @@ def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel
             if channel in taken or not topic.count:
                 continue
             taken.add(channel)
-            count = max((f.count for f in topic.fields if f.type.endswith("[]")), default=1)
+            count = max((f.count for f in topic.fields if f.type.endswith("]")), default=1)
             wheels = joints if topic.joints else count if channel in PER_WHEEL else 0
             yield _TopicChannel(channel, topic, wheels, _pose_question(channel, topic))
         if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
@@ -191,6 +205,33 @@ def _by_field_names(
                 "the order of the joints?"
             )
             yield _TopicChannel(meaning.channel, topic, wheels, ask, field.path, unit)
+
+
+def _by_topic_names(
+    topics: Sequence[Topic], channels: Sequence[_TopicChannel]
+) -> Iterator[_TopicChannel]:
+    """Yield channels whose wheels have topics of their own, with a single number in a message.
+
+    They are recognised by the names of the topics. Channels in `channels` already are omitted.
+    """
+    found: dict[str, dict[str, Topic]] = {}
+    for topic in topics:
+        if topic.count and (number := _NUMBER.fullmatch(topic.type)):
+            meaning = meaning_of(topic.name)
+            channel = meaning.channel
+            if channel == "wheel_position":
+                channel = "wheel_ticks" if "Int" in number[1] else "wheel_angle"
+            if channel in PER_WHEEL and meaning.label:
+                found.setdefault(channel, {}).setdefault(meaning.label, topic)
+    taken = {one.channel for one in channels}
+    for channel in (name for name in found if name not in taken):
+        first, *others = (found[channel][label] for label in sorted(found[channel], key=rank))
+        unit = CHANNELS[channel]
+        ask = f"guessed from the topics' names: is it {channel}, in {unit}, in this order?"
+        if others:
+            yield _TopicChannel(
+                channel, first, 1 + len(others), ask, "data", unit, beside=tuple(others)
+            )
 
 
 def _pose_question(channel: str, topic: Topic) -> str:
@@ -223,6 +264,10 @@ def _layout_lines(
         if "ticks_per_revolution" in robot.defaults:
             ask = "how many, of the motor shaft, all edges counted?"
         lines.append(line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
+        types = (one.topic.type for one in channels if one.channel == "wheel_ticks" and one.beside)
+        bits = (_NUMBER.fullmatch(name) for name in types)
+        if bit := next((found[2] for found in bits if found and found[2] in ("8", "16")), None):
+            lines.append(line("tick_bits", int(bit)))
     lines.append(ConfigLine("gear_ratio", toml(robot.gear_ratio), "as above"))
     if "current" in have:
         ask = "do currents have a sign, or are they magnitudes?"
@@ -232,7 +277,7 @@ def _layout_lines(
 
 def _unused(topics: Sequence[Topic], channels: Sequence[_TopicChannel]) -> tuple[str, ...]:
     """Return a comment for each unused topic, with the fields of its messages."""
-    used, notes = {one.topic.name for one in channels}, []
+    used, notes = {topic.name for one in channels for topic in one.topics}, []
     for topic in topics:
         if topic.name in used:
             continue

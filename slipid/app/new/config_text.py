@@ -124,7 +124,7 @@ def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
     """Return the table `[parameters]`, with choices that suit logs with the given channels."""
     free, fixed = "{ free = true }", "{ free = false }"
     lines = [ConfigLine('"camera.marker_yaw"', free, "marker's heading less the robot's [rad]")]
-    if channels & {"current", "motor_torque", "wheel_torque"}:
+    if "current" in channels:
         voltage = "voltage" in channels or {"duty", "bus_voltage"} <= channels
         ask = "" if voltage else _DATASHEET
         resistance = "{ prior = { mean = 1.0, std = 0.5 } }"
@@ -133,7 +133,7 @@ def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
             ConfigLine('"motor.resistance"', resistance, "[ohm], datasheet", ask),
             ConfigLine('"motor.back_emf"', emf, "[V s/rad]"),
         ]
-    else:
+    elif not channels & {"motor_torque", "wheel_torque"}:
         lines += [
             ConfigLine('"motor.*"', fixed, "no current: motors unknown"),
             ConfigLine('"surface.*.friction"', fixed, "nor the friction of floors"),

@@ -17,9 +17,9 @@ COLUMNS_HELP = (
 )
 _EXAMPLES = (
     'With a quaternion: pose_quaternion = { columns = ["qx", "qy", "qz", "qw"], unit = "1" }',
-    'Effort of a JointState: current (unit "A"), or motor_torque or wheel_torque (unit "N*m"), for '
-    "which the layout needs torque_constant [N m/A]. Sensors may be slower than the rows: leave "
-    "cells empty, or repeat the last value.",
+    'Effort of a JointState: current (unit "A"), or motor_torque or wheel_torque (unit "N*m"); '
+    "torque_constant [N m/A] in the layout makes currents of torques. Sensors may be slower than "
+    "the rows: leave cells empty, or repeat the last value.",
     "More files of the same run, each with its own rows, beside the first one:",
     '[layouts.mine.beside."mocap.csv"]    # or "{stem}_pose.csv"; keys as above',
     '[layouts.mine.beside."mocap.csv".columns]',

@@ -32,10 +32,7 @@ from slipid.app.new.units import (
 )
 from slipid.data.reading.units import factor
 
-ASK_EFFORT = (
-    "what is it: a current (unit A), a torque (N*m, and torque_constant in the layout), a voltage "
-    "(V) or a duty (1)?"
-)
+ASK_EFFORT = "what is it: a current (unit A), a torque (N*m), a voltage (V) or a duty (1)?"
 _ASK_COLUMNS = "which column holds what? There are: {}"
 _SUPPLY_CURRENT = (
     "positive in both directions of the wheels, and negative at times, so it is the battery's: "
@@ -182,9 +179,8 @@ def channel_draft(
 def _unusable(found: FileChannel, run: RunStudy) -> dict[str, str] | None:
     """Return the question or comment about a channel that must not be used as it is, else None."""
     channel = found.channel
-    if channel.endswith("torque"):
-        effort = "give torque_constant [N m/A] in the layout"
-        return {"question": effort if found.unit == "N*m" else ASK_EFFORT}
+    if channel.endswith("torque") and found.unit != "N*m":
+        return {"question": ASK_EFFORT}
     if channel == "current" and run.of_supply:
         return {"comment": _SUPPLY_CURRENT}
     runs = (run.find(channel) for run in run.runs)

@@ -117,12 +117,12 @@ class MotionPair:
         moved = body_steps(self.pose[edges])[:, list(self.components)]
         return PoseIncrements(first[whole], last[whole], moved[whole])
 
-    def turned_at(self, at: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
+    def turned_at(self, at: Float[np.ndarray, "*at"]) -> Float[np.ndarray, "*at column"]:
         """Return `turned` interpolated at times on the robot's clock [s]."""
         inside = np.clip(at, self.time[0], self.time[-1])
         turned = np.asarray(self._spline(inside))
         if self.goes_on:
-            beyond = (at - inside)[:, None]
+            beyond = (at - inside)[..., None]
             turned = turned + beyond * np.where(beyond < 0, *self._end_rates)
         return turned
 
@@ -143,6 +143,8 @@ class MotionPair:
         return np.asarray((self._spline(within) - self._spline(ends)) / (within - ends)[:, None])
 
 
+_MOST_AT_ONCE = 50_000
+"""Largest number of interpolated times in all pairs at once."""
 LEAST_STEPS = 20
 """Least number of steps for a fit of offset and drift."""
 LEAST_PER_COLUMN = 3
@@ -174,20 +176,23 @@ def unexplained(
     whole = (moved**2).sum(axis=0)
     moves = whole > 0
 
-    def share(offset: float) -> float:
-        turned = np.concatenate(
-            [
-                pair.turned_at(one.last + offset) - pair.turned_at(one.first + offset)
-                for pair, one in zip(pairs, steps, strict=True)
-            ]
-        )
+    def share(turned: Float[np.ndarray, "step column"]) -> float:
         if len(turned) < LEAST_PER_COLUMN * turned.shape[1]:
             return 1.0
         rest = moved - turned @ np.linalg.lstsq(turned, moved, rcond=pairs[0].collinear)[0]
         shares = np.where(moves, (rest**2).sum(axis=0) / np.where(moves, whole, 1.0), 1.0)
         return float(np.exp(np.log(shares.clip(1e-12)).mean()))
 
-    return np.array([share(float(offset)) for offset in offsets])
+    # The turns are interpolated at several offsets at once, in blocks that need little memory.
+    size = max(1, _MOST_AT_ONCE // max(len(moved), 1))
+    out = []
+    for block in (offsets[k : k + size, None] for k in range(0, len(offsets), size)):
+        turned = [
+            pair.turned_at(one.last + block) - pair.turned_at(one.first + block)
+            for pair, one in zip(pairs, steps, strict=True)
+        ]
+        out += [share(one) for one in np.concatenate(turned, axis=1)]
+    return np.array(out)
 
 
 def clear_best(

@@ -202,7 +202,7 @@ def electric(
             values = data.channels[name].value[driving]
             yield from _sign_findings(values, speed[driving], declared[driving], name)
     magnitude = {name: np.abs(c.value[driving]) for name, c in data.channels.items()}
-    current = magnitude.get("current")
+    current = None if data.current_is_torque else magnitude.get("current")
     voltage = magnitude.get("voltage", magnitude.get("bus_voltage"))
     power = None
     if by_power and current is not None and voltage is not None and mass_kg is not None:

@@ -66,6 +66,7 @@ class JoinedRuns:
             integrals [rad, m] of the rates in `INTEGRATED`, and values of currents [A] and voltages
             [V].
         current_is_signed: False if some run has only magnitudes of currents.
+        current_is_torque: True if the values of currents are torques [N m].
         reading: what the angles were computed from; `whole` holds for all runs.
     """
 
@@ -77,6 +78,7 @@ class JoinedRuns:
     pose: JoinedChannel
     channels: Mapping[str, JoinedChannel]
     current_is_signed: bool
+    current_is_torque: bool
     reading: WheelReading
 
     @property
@@ -152,6 +154,7 @@ def joined(data: Runs) -> JoinedRuns:
         pose=JoinedChannel(time[fresh], data.pose[fresh]),
         channels=channels,
         current_is_signed=data.current_is_signed,
+        current_is_torque=data.current_is_torque,
         reading=replace(
             data.logs[0].wheel_reading, whole=all(log.wheel_reading.whole for log in data.logs)
         ),

@@ -50,8 +50,9 @@ def assembled(run: RawRun, layout: SensorLayout) -> Log:
     angle = _angle(turns, signals, layout, clock, remarks)
     pose, fresh = _pose(signals, clock)
     start = clock[0] if clock[0] > EPOCH else 0.0
-    voltage = held.get("voltage")
-    if voltage is None and {"duty", "bus_voltage"} <= held.keys():
+    is_torque = layout.torque_constant is None and "current" in wheels.keys() - signals.keys()
+    voltage = None if is_torque else held.get("voltage")
+    if voltage is None and not is_torque and {"duty", "bus_voltage"} <= held.keys():
         voltage = held["duty"] * held["bus_voltage"]
     return Log(
         **vars(run.identity),
@@ -64,6 +65,7 @@ def assembled(run: RawRun, layout: SensorLayout) -> Log:
         current=held.get("current"),
         current_fresh=_fresh(wheels.get("current"), clock),
         current_is_signed=layout.current_is_signed,
+        current_is_torque=is_torque,
         voltage=voltage,
         voltage_fresh=_fresh(wheels.get("voltage", wheels.get("duty")), clock),
         duty=held.get("duty"),
@@ -189,9 +191,10 @@ def _of_wheels(signals: Mapping[str, Signal], layout: SensorLayout) -> dict[str,
 
     The computed speeds are the motor speeds divided by the gear ratio. The computed currents are
     the motor torques divided by the torque constant; wheel torques are divided by the gear ratio as
-    well.
+    well. Without a torque constant they are the torques at the wheel (`Log.current_is_torque`).
     """
-    gear, constant = layout.gear_ratio, float(layout.torque_constant or 1.0)
+    gear = layout.gear_ratio
+    constant = 1.0 / gear if layout.torque_constant is None else float(layout.torque_constant)
     out = dict(signals)
     for name, logged, ratio in (
         ("wheel_speed", "motor_speed", gear),

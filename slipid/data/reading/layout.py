@@ -110,8 +110,9 @@ class SensorLayout:
             count.
         tick_bits: number of bits of the tick counter, after which it wraps around.
         current_is_signed: false if the logged currents are magnitudes.
-        torque_constant: torque of the *motor* per current [N m/A], needed if the logs have torques
-            instead of currents.
+        torque_constant: torque of the *motor* per current [N m/A], by which logged torques become
+            currents. Without it, a fit compares torques with those of its contact and friction, and
+            fits nothing electric.
         max_gap: longest allowed time between two samples of a wheel [s]; a log with a longer gap is
             an error.
         max_pose_jump: longest allowed distance between two successive poses [m]; a run with a
@@ -138,9 +139,6 @@ class SensorLayout:
         have = {*channels}
         if "wheel_ticks" in have and self.ticks_per_revolution is None:
             return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
-        if {"motor_torque", "wheel_torque"} & have and self.torque_constant is None:
-            wanted = "expected the motor's torque per current [N m/A]"
-            return f"a torque channel without torque_constant; {wanted}"
         turned = {"pose_heading", "pose_quaternion"} & have
         if 0 < len({"pose_x", "pose_y"} & have) + len(turned) != 3:
             return (

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from slipid.data.reading.containers import refuse_other
 from slipid.data.reading.layout import Channel, Layout
 from slipid.data.reading.units import same_unit
 from slipid.support.errors import bad_data, first_names
@@ -106,6 +107,7 @@ def bytes_of(path: Path, limit: int = -1) -> bytes:
     """
     if path.is_dir():
         raise bad_data(path, "a folder", "a CSV or Parquet file")
+    refuse_other(path)
     try:
         with path.open("rb") as file:
             raw = file.read(limit)

@@ -123,16 +123,16 @@ def estimates(
         has_voltage: True if voltages were logged.
         flat: paths of the parameters that change along flat directions.
     """
-    tree, out = space.tree(z), []
+    tree, slices, out = space.tree(z), space.slices, []
     for e in space.all:
         d, value = e.declaration, np.atleast_1d(np.asarray(e.get(tree), float))
         base = Estimate(path=e.path, unit=d.unit, doc=d.doc, labels=e.labels, value=plain(value))
-        if e.path not in space.slices:
+        if e.path not in slices:
             chosen = [c for c in choices if fnmatchcase(e.path, c.pattern)]
             is_override = any(c.fixed is not None or c.start is not None for c in chosen)
             out.append(replace(base, provenance="override") if is_override else base)
             continue
-        at, forced = space.slices[e.path], None
+        at, forced = slices[e.path], None
         mean, prior = np.asarray(z)[at], (space.prior_mean[at], space.prior_std[at])
         if e.path in NEEDS_VOLTAGE and not has_voltage:
             forced = "not_identified"
@@ -270,16 +270,17 @@ def derived(
     its prior std. If draws of a posterior are given, z and `covariance` must be their mean and
     covariance; the intervals are then those of the draws.
     """
+    slices = space.slices
     pairs = [
         (over.path, under, d)
         for (quantity, under), d in RATIOS.items()
         for over in space.free
-        if over.quantity == quantity and under in space.slices
+        if over.quantity == quantity and under in slices
     ]
     out = []
     for over, under, d in pairs:
         c = np.zeros(len(z))
-        c[space.slices[over]], c[space.slices[under]] = 1.0, -1.0
+        c[slices[over]], c[slices[under]] = 1.0, -1.0
         mean, block = np.atleast_1d(c @ z), np.atleast_2d(c @ covariance @ c)
         prior_std = np.atleast_1d(np.sqrt(np.sum((c * space.prior_std) ** 2)))
         base = Estimate(path=f"{over}/{under}", unit=d.unit, doc=d.doc, value=float(np.exp(c @ z)))

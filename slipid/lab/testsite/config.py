@@ -15,7 +15,7 @@ import numpy as np
 from slipid.data import floor_map as terrain
 from slipid.data.write import OPTIONAL, own_columns
 from slipid.lab.testsite import driving as ex
-from slipid.lab.testsite.sections import MapRuns, SimulationContent
+from slipid.lab.testsite.sections import SIDEWAYS, MapRuns, SimulationContent
 from slipid.lab.testsite.site import Site
 from slipid.lab.testsite.surfaces import SURFACES
 from slipid.support.errors import DataError
@@ -29,9 +29,7 @@ _IDENTIFY_CONFIG = """\
 # The logs were simulated by slipid simulate; the true values are in truth/, which no fit reads.
 
 [robot]
-drive = "omni"
-wheel_azimuths_deg = {azimuths}
-base_radius_m = {base}
+{wheels}
 wheel_radius_m = {radius}
 gear_ratio = {gear}
 mass_kg = {mass}
@@ -48,9 +46,10 @@ current_is_signed = {signed}
 "camera.scale" = {{ prior = {{ mean = {scale}, std = 0.002 }} }}      # measured, with an error
 "camera.lag" = {{ prior = {{ mean = {lag}, std = 0.02 }} }}
 "camera.marker_yaw" = {{ free = true }}
-"motor.resistance" = {{ start = 11.0, prior = {{ mean = 8.0, std = 4.0 }} }}
-"motor.back_emf" = {{ start = 0.0257, prior = {{ mean = 0.04, std = 0.02 }} }}
-"""
+"motor.resistance" = {{ start = {r[0]}, prior = {{ mean = {r[1]}, std = {r[2]} }} }}
+"motor.back_emf" = {{ start = {c[0]}, prior = {{ mean = {c[1]}, std = {c[2]} }} }}
+{place}"""
+_MARKER_PLACE = '"camera.marker_place" = { prior = { mean = [0.0, 0.0], std = 0.1 } }\n'
 _TRACKED_LAYOUT = """
 # poses of each run, tracked in its video by slipid track, for example:
 #   slipid track video/as_built/firm/run000.avi --camera video/camera.json \\
@@ -101,10 +100,12 @@ def plan(path: Path, text: str) -> SimulationPlan:
             if name in SURFACES and isinstance(given, dict)
         }
         mapping = {**mapping, "surfaces": {**surfaces, **known}}
+    if isinstance(robot := mapping.get("robot"), dict):
+        mapping = {**mapping, "robot": {"drive": "omni", **robot}}
     content = checked(path, mapping, SimulationContent)
-    robot = content.robot, content.motor, content.speed_loop, content.sensors
+    parts = content.robot, content.motor, content.speed_loop, content.sensors
     surfaces = {**SURFACES, **content.surfaces}
-    site = Site(*robot, surfaces, content.command_delay_s, content.acceleration_m_s2)
+    site = Site(*parts, surfaces, content.command_delay_s, content.acceleration_m_s2)
     maps, everything = {}, list[ex.SiteRun]()
     for name, given in content.maps.items():
         with _naming(f"{path}: maps.{name}"):
@@ -140,6 +141,12 @@ def _check(
             )
     for k, runs in enumerate(content.runs, 1):
         _refuse_unknown(path, f"runs[{k}].load", runs.load, site.robot.centres_m)
+        if runs.kind in SIDEWAYS and site.robot.drive != "omni":
+            raise DataError(
+                f"{path}: runs[{k}].kind: '{runs.kind}' drives sideways, which a "
+                f"{site.robot.drive} robot cannot; expected one of arcs, spins, paths, wander, "
+                "rectangle"
+            )
         if isinstance(runs, MapRuns):
             _refuse_unknown(path, f"runs[{k}].map", runs.map, maps)
         else:
@@ -159,11 +166,11 @@ def _check(
             )
     if "robotino2022" in content.formats:
         robot, sensors = site.robot, site.sensors
-        fits = len(robot.wheel_azimuths_deg) == 3 and robot.gear_ratio == 16
+        fits = robot.drive == "omni" and robot.drives == 3 and robot.gear_ratio == 16
         fits &= site.motor.ticks_per_revolution == 2000 and not sensors.current_is_signed
         if not fits:
             raise DataError(
-                f"{path}: formats: robotino2022 is only for three wheels, gear ratio 16, 2000 "
+                f"{path}: formats: robotino2022 is only for three omni wheels, gear ratio 16, 2000 "
                 "ticks and unsigned currents; expected the format slipid for other robots"
             )
 
@@ -210,7 +217,8 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
     robot, sensors = plan.site.robot, plan.site.sensors
     measured = 0.0015 * float(np.random.default_rng([plan.content.seed, 2]).normal())
     more = [channel for channel in OPTIONAL if getattr(sensors, channel)]
-    columns = own_columns(len(robot.wheel_azimuths_deg), more)
+    columns = own_columns(robot.drives, more)
+    resistance, back_emf = plan.site.motor.resistance_ohm, plan.site.motor.back_emf_vs
     beside, scale, lag = "", sensors.camera_scale, 0.05
     if by_video:
         columns = {name: c for name, c in columns.items() if not name.startswith("pose_")}
@@ -225,8 +233,7 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
         for load, name, floor in where
     )
     return _IDENTIFY_CONFIG.format(
-        azimuths=list(robot.wheel_azimuths_deg),
-        base=robot.base_radius_m,
+        wheels="\n".join(f"{key} = {_inline(v)}" for key, v in robot.drive_section.items()),
         radius=robot.wheel_radius_m,
         gear=robot.gear_ratio,
         mass=robot.mass_kg,
@@ -238,6 +245,10 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
         beside=beside,
         scale=round(scale * (1 + measured), 4),
         lag=lag,
+        place="" if robot.drive == "omni" else _MARKER_PLACE,
+        # vague, and away from the true values
+        r=[float(f"{f * resistance:.3g}") for f in (2.0, 1.4545, 0.7273)],
+        c=[float(f"{f * back_emf:.3g}") for f in (0.5, 0.778, 0.389)],
     )
 
 

@@ -15,6 +15,10 @@ PERIOD = 0.05
 """Time between two commands to the robot [s]."""
 REACHED_M = 0.02
 """Distance at which a way-point counts as reached [m]."""
+SPIN_ARM_M = 0.125
+"""Arm at which the length of a turn on the spot is measured [m]."""
+STEERING = 1.0
+"""Turn rate over the angle to the next way-point, and largest turn rate [1/s], [rad/s]."""
 BodyTwist = tuple[float, float, float]
 """Forward and leftward speed [m/s], and turn rate [rad/s]."""
 
@@ -40,7 +44,9 @@ class TimedTwists:
 
 @dataclass(frozen=True)
 class Waypoints:
-    """Closed-loop program: positions to reach one after the other, without turning.
+    """Closed-loop program: positions to reach one after the other.
+
+    A robot that can drive sideways does not turn; any other turns towards the next position.
 
     Attributes:
         places: x, y of the positions [m], in the frame of the pose that `by` chooses.
@@ -65,6 +71,7 @@ class Waypoints:
         longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / self.speed
         pose, back = np.zeros(3), np.linalg.pinv(plant.robot.wheel_from_twist)
         angle, goals = plant.wheel_angle, list(self.places)
+        sideways = bool(plant.robot.wheel_from_twist[:, 1].any())
         while plant.time <= longest:
             before, angle = angle, plant.wheel_angle
             pose = _moved(pose, back @ (angle - before))
@@ -76,9 +83,15 @@ class Waypoints:
                 return
             offset = goals[0] - pose[:2]
             distance = float(np.hypot(*offset))
-            x, y = min(self.speed, max(0.05, 2.0 * distance)) * offset / distance
+            speed = min(self.speed, max(0.05, 2.0 * distance))
+            x, y = speed * offset / distance
             c, s = np.cos(pose[2]), np.sin(pose[2])
-            yield float(c * x + s * y), float(c * y - s * x), 0.0
+            ahead, left = float(c * x + s * y), float(c * y - s * x)
+            if sideways:
+                yield ahead, left, 0.0
+            else:
+                turn = STEERING * float(np.arctan2(left, ahead))
+                yield max(ahead, 0.0), 0.0, min(max(turn, -STEERING), STEERING)
 
 
 def _moved(pose: Float[np.ndarray, "3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -133,10 +146,10 @@ def straight(
         heading: direction of the commanded motion in the body frame [rad].
         speed: commanded speed [m/s]; 0 for a turn on the spot.
         distance: commanded path length [m]; for a turn on the spot, the arc length of a point at
-            0.125 m from the middle of the robot [m].
+            `SPIN_ARM_M` from the middle of the robot [m].
         turn: commanded turn rate [rad/s].
     """
-    seconds = distance / (speed or abs(turn) * 0.125)
+    seconds = distance / (speed or abs(turn) * SPIN_ARM_M)
     twist = (speed * float(np.cos(heading)), speed * float(np.sin(heading)), turn)
     back = 0.0 if speed == 0 else 0.5 * distance
     start = (-back * float(np.cos(heading)), -back * float(np.sin(heading)), 0.0)
@@ -164,13 +177,16 @@ def named_runs(runs: Sequence[SiteRun], jitter: float, seed: int) -> list[tuple[
 class Trace:
     """True motion of a run, with one row per time step.
 
+    Wheel angles, wheel speeds and commands have a value for each motor: those of the first of the
+    wheels that it turns.
+
     Attributes:
         time: time since the robot had settled on the floor [s].
         pose: pose of the body: x, y [m], heading [rad].
         yaw_rate: yaw rate of the body [rad/s].
-        wheel_angle: angle of each wheel [rad].
-        wheel_speed: speed of each wheel [rad/s].
-        wheel_command: commanded speed of each wheel [rad/s].
+        wheel_angle: angle of the wheels [rad].
+        wheel_speed: speed of the wheels [rad/s].
+        wheel_command: commanded speed of the wheels [rad/s].
         current: current of each motor, signed along the drive direction [A].
         voltage: voltage of each motor, signed along the drive direction [V].
         bus: voltage of the supply [V].
@@ -181,11 +197,11 @@ class Trace:
     time: Float[np.ndarray, " step"]
     pose: Float[np.ndarray, "step 3"]
     yaw_rate: Float[np.ndarray, " step"]
-    wheel_angle: Float[np.ndarray, "step wheel"]
-    wheel_speed: Float[np.ndarray, "step wheel"]
-    wheel_command: Float[np.ndarray, "step wheel"]
-    current: Float[np.ndarray, "step wheel"]
-    voltage: Float[np.ndarray, "step wheel"]
+    wheel_angle: Float[np.ndarray, "step drive"]
+    wheel_speed: Float[np.ndarray, "step drive"]
+    wheel_command: Float[np.ndarray, "step drive"]
+    current: Float[np.ndarray, "step drive"]
+    voltage: Float[np.ndarray, "step drive"]
     bus: Float[np.ndarray, " step"]
     sinkage: Float[np.ndarray, "step wheel"]
     twist_command: Float[np.ndarray, "step 3"]
@@ -223,13 +239,16 @@ def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Tr
     rows: list[tuple[float | list[float] | np.ndarray, ...]] = []
 
     def record() -> None:
-        """Append the engine's state to `rows`, in the order of the fields of `Trace`."""
+        """Append the engine's state to `rows`, in the order of the fields of `Trace`.
+
+        Heights of the wheel axes stand for the sinkage, which follows from them at the end.
+        """
         p, d = plant, plant.data
         body, angle = d.qpos[:7].copy(), d.qpos[p.wheel_at] - p.angle_at_start
         wheels = angle, d.qvel[p.wheel_dof], rims.speed
         electric = list(p.drive.current), list(p.drive.voltage), p.drive.bus
-        sinkage = np.maximum(p.robot.wheel_radius_m - d.xpos[p.wheel_body, 2], 0.0)
-        rows.append((p.time, body, d.qvel[5], *wheels, *electric, sinkage, sent))
+        heights = d.xpos[p.wheel_body, 2]
+        rows.append((p.time, body, d.qvel[5], *wheels, *electric, heights, sent))
 
     for twist in run.program.twists(plant):
         sent = np.array(twist)
@@ -243,4 +262,5 @@ def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Tr
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     body = columns[1]
     columns[1] = np.column_stack([body[:, :2], np.unwrap(heading_of(body[:, 3:]))])
+    columns[-2] = np.maximum(site.robot.radii - columns[-2], 0.0)
     return Trace(*columns)

@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap
-from slipid.lab.testsite.robot_build import MotorBuild, WheelDrives, mjcf
+from slipid.lab.testsite.contacts import contacts_of
+from slipid.lab.testsite.motors import MotorBuild, WheelDrives
+from slipid.lab.testsite.robot_build import mjcf
 from slipid.lab.testsite.site import Site
 from slipid.lab.testsite.surfaces import Pose, Terrain, ribs
 from slipid.support.errors import DataError
@@ -16,7 +18,7 @@ TIMESTEP = 1e-3
 SETTLING_S = 0.4
 """Time for which the robot settles on the floor before recording starts [s]."""
 LOOKUP_STEPS = 5
-"""Number of time steps from one lookup of the floor beneath the rollers to the next."""
+"""Number of time steps from one lookup of the floor beneath the wheels to the next."""
 RESISTANCE_SPEED = 0.02
 """Speed at which compaction and body drag reach 0.7 of their full force [m/s]."""
 
@@ -70,7 +72,9 @@ class SimulatedRobot:
         self.data = mujoco.MjData(self.model)
         rng = np.random.default_rng(seed)
         self._look_up(site.motor)
-        self._store_contacts(Terrain(floor, site.surfaces, start, rng))
+        self.terrain = Terrain(floor, site.surfaces, start, rng)
+        self._resists = any(g.compaction or g.body_drag_n for g, _ in self.terrain.kinds)
+        self._contacts = contacts_of(self.robot, load, self.terrain, self.model, timestep)
         self.drive = WheelDrives(
             site.motor, site.loop, self.robot.gear_ratio, len(self.wheel_dof), timestep
         )
@@ -94,14 +98,14 @@ class SimulatedRobot:
 
     @property
     def wheel_angle(self) -> Float[np.ndarray, " wheel"]:
-        """Angle by which each wheel has turned since the robot had settled [rad]."""
+        """Angle by which each drive has turned its wheels since the robot had settled [rad]."""
         return self.data.qpos[self.wheel_at] - self.angle_at_start
 
     def step(self, wanted: list[float]) -> None:
         """Advance by one time step with these commanded wheel speeds [rad/s]."""
         d = self.data
         if self._count % LOOKUP_STEPS == 0:
-            self._look()
+            self._contacts.look(self.data)
             if self._resists:
                 self._apply_resistance()
         self._count += 1
@@ -125,62 +129,29 @@ class SimulatedRobot:
             )
 
     def _look_up(self, motor: MotorBuild) -> None:
-        """Look up wheels and rollers in the engine's arrays, and set the motors' properties."""
-        m, count = self.model, len(self.robot.wheel_azimuths_deg)
-        joints = [m.joint(f"wheel{k}") for k in range(count)]
-        self.wheel_dof = np.array([j.dofadr[0] for j in joints])
-        self.wheel_at = np.array([j.qposadr[0] for j in joints])
-        self.wheel_body = np.array([m.body(f"wheel{k}").id for k in range(count)])
-        each = [(k, j) for k in range(count) for j in range(self.robot.rollers)]
-        self._roller = np.array([m.geom(f"roller{k}_{j}").id for k, j in each])
-        mounts = [m.joint(f"mount{k}_{j}") for k, j in each]
-        self._axle_dof = np.array([m.joint(f"roller{k}_{j}").dofadr[0] for k, j in each])
-        self._mount = np.array([j.id for j in mounts])
-        self._mount_dof = np.array([j.dofadr[0] for j in mounts])
+        """Look up the wheels in the engine's arrays, and set the motors' properties.
+
+        A drive stands for all its wheels: its angle and speed are those of its first wheel.
+        """
+        m, drives = self.model, self.robot.drives
+        wheels = [f"wheel{k}" for k in range(len(self.robot.places))]
+        joints = [m.joint(name) for name in wheels]
+        self.wheel_dof = np.array([j.dofadr[0] for j in joints[:drives]])
+        self._every_wheel_at = np.array([j.qposadr[0] for j in joints])
+        self.wheel_at = self._every_wheel_at[:drives]
+        self.wheel_body = np.array([m.body(name).id for name in wheels])
         m.dof_armature[self.wheel_dof] = motor.rotor_inertia_kg_m2 * self.robot.gear_ratio**2
         m.dof_frictionloss[self.wheel_dof] = motor.coulomb_nm
         m.dof_damping[self.wheel_dof] = motor.viscous_nms
-
-    def _store_contacts(self, terrain: Terrain) -> None:
-        """Store contact parameters for every kind (surface and unevenness level) of the terrain."""
-        self.terrain = terrain
-        kinds = terrain.kinds
-        self._friction = np.array([[g.friction, 0.003, f * g.rolling_m] for g, f in kinds])
-        self._contact = np.array([[max(g.settling_s, 2 * self.dt), 1.0] for g, _ in kinds])
-        mount = self.robot.mount_n_m
-        self._shear = np.array([1 / (1 / mount + f / g.shear_n_m) for g, f in kinds])
-        self._damping = 1.4 * np.sqrt(self._shear * self.robot.roller_mass_kg)
-        self._resists = any(g.compaction or g.body_drag_n for g, _ in kinds)
-        self._beneath = np.full(len(self._roller), -1)
-        self._low = np.full(len(self._roller), -1)
 
     def _put(self, start: Pose, rng: np.random.Generator) -> None:
         """Put the robot at its start pose, with a random angle of every wheel."""
         q = self.data.qpos
         q[:2] = start[:2]
         q[3], q[6] = np.cos(0.5 * start[2]), np.sin(0.5 * start[2])
-        q[self.wheel_at] = rng.uniform(0, 2 * np.pi, len(self.wheel_at))
+        angle = rng.uniform(0, 2 * np.pi, self.robot.drives)
+        q[self._every_wheel_at] = angle[list(self.robot.drive_of)]
         engine().mj_forward(self.model, self.data)
-
-    def _look(self) -> None:
-        """Give every roller the contact parameters of the floor beneath it.
-
-        Rollers that are not near the floor get no bearing friction, which saves computing time.
-        """
-        place = self.data.geom_xpos[self._roller]
-        now, m = self.terrain.at(place[:, :2]), self.model
-        new = np.flatnonzero(now != self._beneath)
-        if len(new):
-            self._beneath = now
-            which, geoms = now[new], self._roller[new]
-            m.geom_friction[geoms] = self._friction[which]
-            m.geom_solref[geoms] = self._contact[which]
-            m.jnt_stiffness[self._mount[new]] = self._shear[which]
-            m.dof_damping[self._mount_dof[new]] = self._damping[which]
-        low = place[:, 2] < 0.5 * self.robot.wheel_radius_m
-        if (low != self._low).any():
-            self._low = low
-            m.dof_frictionloss[self._axle_dof] = np.where(low, self.robot.roller_friction_nm, 0.0)
 
     def _apply_resistance(self) -> None:
         """Apply compaction forces on sunk wheels and the body drag as a wrench on the chassis."""
@@ -190,8 +161,9 @@ class SimulatedRobot:
         places = d.xpos[self.wheel_body]
         beneath = [self.terrain.kinds[k][0] for k in self.terrain.at(places[:, :2]).tolist()]
         fx = fy = moment = 0.0
-        for (x, y, z), surface in zip(places.tolist(), beneath, strict=True):
-            hard = surface.compaction * max(self.robot.wheel_radius_m - z, 0.0) ** 1.5
+        radii = self.robot.radii.tolist()
+        for (x, y, z), radius, surface in zip(places.tolist(), radii, beneath, strict=True):
+            hard = surface.compaction * max(radius - z, 0.0) ** 1.5
             ux, uy = vx - turn * (y - y0), vy + turn * (x - x0)
             size = hard / (ux * ux + uy * uy + RESISTANCE_SPEED**2) ** 0.5
             fx -= size * ux

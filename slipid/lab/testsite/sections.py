@@ -4,12 +4,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from slipid.data import floor_map as terrain
 from slipid.data.floor_map import read_map
-from slipid.lab.testsite.driving import SiteRun, Waypoints, straight
-from slipid.lab.testsite.robot_build import MotorBuild, RobotBuild, SpeedLoop
+from slipid.lab.testsite.driving import SPIN_ARM_M, SiteRun, TimedTwists, Waypoints, straight
+from slipid.lab.testsite.motors import MotorBuild, SpeedLoop
+from slipid.lab.testsite.omni_build import OmniBuild
+from slipid.lab.testsite.ordinary_build import OrdinaryBuild
 from slipid.lab.testsite.site import SiteCamera, SiteSensors
 from slipid.lab.testsite.surfaces import SurfacePhysics
 from slipid.support.toml_file import Section
@@ -121,7 +123,82 @@ class PaperGridRuns(SurfaceRuns):
         for rate in (20, 40, 60):
             for sign in (1, -1):
                 turn = sign * float(np.radians(rate))
-                out.append(self.straight(0.0, 0.0, abs(turn) * 0.125 * self.seconds, turn))
+                out.append(self.straight(0.0, 0.0, abs(turn) * SPIN_ARM_M * self.seconds, turn))
+        return out
+
+
+class ArcRuns(SurfaceRuns):
+    """Runs ahead along arcs and straight lines, backward at negative speeds."""
+
+    kind: Literal["arcs"] = "arcs"
+    curvatures_1_m: list[Annotated[float, Field(ge=-20, le=20)]] = Field(
+        default=[0.0, 0.5, -0.5], min_length=1
+    )
+    speeds_m_s: list[Annotated[float, Field(ge=-3, le=3)]] = Field(default=[0.3], min_length=1)
+    distance_m: Distance = 1.5
+
+    @field_validator("speeds_m_s")
+    @classmethod
+    def _moves(cls, speeds: list[float]) -> list[float]:
+        if 0.0 in speeds:
+            raise ValueError("a speed of 0; expected speeds other than 0, or runs of kind spins")
+        return speeds
+
+    def runs(self) -> list[SiteRun]:
+        return [
+            self.straight(0.0 if v > 0 else np.pi, abs(v), self.distance_m, v * curvature)
+            for v in self.speeds_m_s
+            for curvature in self.curvatures_1_m
+        ]
+
+
+class SpinRuns(SurfaceRuns):
+    """Turns on the spot, to the right at negative rates."""
+
+    kind: Literal["spins"] = "spins"
+    rates_deg_s: list[Annotated[float, Field(ge=-360, le=360)]] = Field(
+        default=[40.0, -40.0], min_length=1
+    )
+    angle_deg: float = Field(360.0, gt=0, le=3600)
+
+    @field_validator("rates_deg_s")
+    @classmethod
+    def _turns(cls, rates: list[float]) -> list[float]:
+        if 0.0 in rates:
+            raise ValueError("a rate of 0; expected rates other than 0")
+        return rates
+
+    def runs(self) -> list[SiteRun]:
+        arc = SPIN_ARM_M * float(np.radians(self.angle_deg))
+        return [self.straight(0.0, 0.0, arc, w) for w in np.radians(self.rates_deg_s).tolist()]
+
+
+class PathRuns(SurfaceRuns):
+    """Runs of random arcs, straight lines and turns on the spot, one after the other.
+
+    Every fourth leg, on average, is a turn on the spot; the others are driven at one of the
+    speeds, with turn rates from 0 to `turn_deg_s` to either side.
+    """
+
+    kind: Literal["paths"] = "paths"
+    seed: int = Field(0, ge=0)
+    count: int = Field(4, ge=1, le=10_000)
+    legs: int = Field(4, ge=1, le=1000)
+    leg_s: float = Field(2.5, gt=0, le=3600)
+    speeds_m_s: Speeds = Field(default=[0.2, 0.4])
+    turn_deg_s: float = Field(40.0, gt=0, le=360)
+
+    def runs(self) -> list[SiteRun]:
+        rng, most = np.random.default_rng(self.seed), float(np.radians(self.turn_deg_s))
+        out = []
+        for k in range(self.count):
+            speed, legs = self.speeds_m_s[k % len(self.speeds_m_s)], []
+            for _ in range(self.legs):
+                turn = float(rng.uniform(-most, most))
+                on_the_spot = rng.uniform() < 0.25
+                legs.append(((0.0 if on_the_spot else speed, 0.0, turn), self.leg_s))
+            program = TimedTwists((*legs, ((0.0, 0.0, 0.0), 0.3)))
+            out.append(SiteRun(self.surface, self.load, program))
         return out
 
 
@@ -161,9 +238,10 @@ class WanderRuns(MapRuns):
 
 
 class RectangleRuns(MapRuns):
-    """Runs along the 2021 paper's rectangle of 900 x 400 mm on a map, without turning.
+    """Runs along the 2021 paper's rectangle of 900 x 400 mm on a map.
 
-    The sides are driven forward, right, back, left. With `by = "encoders"` the robot steers to the
+    A robot that can drive sideways does not turn: the sides are driven forward, right, back, left.
+    With `by = "encoders"` the robot steers to the
     corners by dead reckoning.
     """
 
@@ -185,9 +263,20 @@ class RectangleRuns(MapRuns):
 
 
 Runs = Annotated[
-    HeadingRuns | CurveRuns | PaperGridRuns | WanderRuns | RectangleRuns,
+    HeadingRuns
+    | CurveRuns
+    | PaperGridRuns
+    | ArcRuns
+    | SpinRuns
+    | PathRuns
+    | WanderRuns
+    | RectangleRuns,
     Field(discriminator="kind"),
 ]
+
+
+SIDEWAYS = ("headings", "curves", "paper_grid")
+"""Kinds of runs in directions that only robots that can drive sideways can take."""
 
 
 class SimulationContent(Section):
@@ -198,7 +287,7 @@ class SimulationContent(Section):
     heading_jitter_deg: float = Field(5.0, ge=0, le=180)
     command_delay_s: float = Field(0.12, ge=0, le=10)
     acceleration_m_s2: float = Field(1.0, ge=0.01, le=1000)
-    robot: RobotBuild = Field(default_factory=RobotBuild)
+    robot: OmniBuild | OrdinaryBuild = Field(default_factory=OmniBuild, discriminator="drive")
     motor: MotorBuild = MotorBuild()
     speed_loop: SpeedLoop = SpeedLoop()
     sensors: SiteSensors = SiteSensors()

@@ -20,6 +20,7 @@ from slipid.data.wheel_signals import interpolate
 from slipid.data.write import own_csv, robotino2022_csv
 from slipid.lab.testsite.config import SimulationPlan, all_filmed, can_identify, identify_config
 from slipid.lab.testsite.driving import SiteRun, Trace, drive
+from slipid.lab.testsite.kinematics import Motion, effective_kinematics
 from slipid.lab.testsite.plant import engine
 from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.lab.testsite.studio import Studio, film
@@ -99,6 +100,8 @@ def _camera(
     taken = np.arange(first, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
     taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken + delay <= 0.0)]
     poses = interpolate(trace.time, trace.pose, taken)
+    (x, y), c, sn = site.robot.marker_place_m, np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    poses[:, :2] += np.stack([c * x - sn * y, sn * x + c * y], axis=1)
     poses[:, 2] += float(np.radians(site.robot.marker_yaw_deg))
     poses[:, :2] += s.camera_noise_m * rng.normal(size=(len(taken), 2))
     poses[:, 2] += s.camera_noise_rad * rng.normal(size=len(taken))
@@ -165,6 +168,10 @@ def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Report
     pace = seconds / max(time.monotonic() - began, 1e-9)
     filmed = [task for task in every if task.name in plan.filmed]
     _film(filmed, plan.content.camera, executor, report)
+    if plan.site.robot.drive != "omni":
+        found = effective_kinematics(plan.site.robot, map(_motion, every))
+        path, schema = out / "truth" / "kinematics.json", "slipid.kinematics/1"
+        write_json(path, {"schema": schema, "load_setups": found})
     content = {**about, "runs": [name for name, _ in plan.runs]}
     write_json(manifest, content)
     return {**content, "driven": len(todo), "seconds": seconds, "pace": pace if todo else None}
@@ -206,6 +213,12 @@ def _video_path(task: SiteTask) -> Path:
 
 def _truth_path(task: SiteTask) -> Path:
     return task.out / "truth" / f"{task.name}.npz"
+
+
+def _motion(task: SiteTask) -> Motion:
+    """Return the true motion of a run that was driven."""
+    with np.load(_truth_path(task)) as true:
+        return task.run, true["pose"], true["wheel_angle"]
 
 
 def drive_and_write(task: SiteTask) -> float:
@@ -284,5 +297,6 @@ def truth(site: Site) -> dict[str, Content]:
         "camera.scale": (sensors.camera_scale, "1"),
         "camera.lag": (sensors.lag_s, "s"),
         "camera.marker_yaw": (float(np.radians(robot.marker_yaw_deg)), "rad"),
+        "camera.marker_place": (list(robot.marker_place_m), "m"),
     }
     return {path: {"value": value, "unit": unit} for path, (value, unit) in found.items()}

@@ -10,7 +10,9 @@ from pydantic import Field, FiniteFloat
 from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import Rotation
 
-from slipid.lab.testsite.robot_build import MotorBuild, RobotBuild, SpeedLoop
+from slipid.lab.testsite.motors import MotorBuild, SpeedLoop
+from slipid.lab.testsite.omni_build import OmniBuild
+from slipid.lab.testsite.ordinary_build import OrdinaryBuild
 from slipid.lab.testsite.surfaces import SURFACES, SurfacePhysics
 from slipid.support.content import Content
 from slipid.support.toml_file import CLOSED, NotNegative, Part, Positive
@@ -104,7 +106,7 @@ class Site:
         acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
     """
 
-    robot: RobotBuild = field(default_factory=RobotBuild)
+    robot: OmniBuild | OrdinaryBuild = field(default_factory=OmniBuild)
     motor: MotorBuild = field(default_factory=MotorBuild)
     loop: SpeedLoop = field(default_factory=SpeedLoop)
     sensors: SiteSensors = field(default_factory=SiteSensors)

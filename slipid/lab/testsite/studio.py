@@ -81,8 +81,9 @@ class Studio:
         self.model = mujoco.MjModel.from_xml_string(xml, assets)
         self.data = mujoco.MjData(self.model)
         self._forward = mujoco.mj_forward
-        count = range(len(site.robot.wheel_azimuths_deg))
-        self._wheels = [self.model.joint(f"wheel{k}").qposadr[0] for k in count]
+        wheels = range(len(site.robot.places))
+        self._drive_of = list(site.robot.drive_of)
+        self._wheels = [self.model.joint(f"wheel{k}").qposadr[0] for k in wheels]
         try:
             self._renderer = mujoco.Renderer(self.model, height, width)
         except Exception as error:
@@ -108,7 +109,7 @@ class Studio:
         """
         q = self.data.qpos
         q[:2], q[3], q[6] = pose[:2], np.cos(0.5 * pose[2]), np.sin(0.5 * pose[2])
-        q[self._wheels] = wheel_angle
+        q[self._wheels] = wheel_angle[self._drive_of]
         self._forward(self.model, self.data)
         self._renderer.update_scene(self.data, "overhead")
         drawn = np.ascontiguousarray(self._renderer.render()[:, :, ::-1])

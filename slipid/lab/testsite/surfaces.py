@@ -30,11 +30,12 @@ class SurfacePhysics:
     """Physics of one surface.
 
     Attributes:
-        friction: Coulomb friction coefficient between a roller and the surface [1].
-        rolling_m: lever arm of the rolling friction, about both axes of a roller [m].
+        friction: Coulomb friction coefficient between a roller or wheel and the surface [1].
+        rolling_m: lever arm of the rolling friction, about both axes of a roller, or about the axle
+            of an ordinary wheel [m].
         softness_m: approximate sinkage of a wheel that carries a third of the robot, for any weight
             of the robot [m].
-        shear_n_m: horizontal stiffness of the floor beneath one roller [N/m].
+        shear_n_m: horizontal stiffness of the floor beneath one roller or ordinary wheel [N/m].
         compaction: resistance force of a sunk wheel over its sinkage to the power of 1.5
             [N/m^1.5].
         body_drag_n: drag force against translation of the body, as by a deep carpet pile [N].

@@ -270,7 +270,7 @@ def controller_names(text: str | None) -> tuple[str, ...]:
 def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
     """Raise `DataError` if the test site lacks a surface or load set-up, or `wheels` differs."""
     robot, other = Site().robot, "Use --plant twin, which simulates the identified model itself"
-    has = len(robot.wheel_azimuths_deg)
+    has = len(robot.places)
     if wheels != has:
         raise DataError(f"the test site's robot has {has} wheels, the fit's {wheels}. {other}")
     for what, name, there in (

@@ -173,3 +173,25 @@ def test_a_long_drive_with_pauses_is_cut_at_them_in_one_session(tmp_path):
     assert layout["runs"] == {"pause_s": 1}
     assert there["logs"][0]["session"] == "file"
     assert len(runs_of(bag, declared_bag_layout(layout, "mine"))) == 3
+
+
+def test_wheels_with_topics_of_their_own_are_known_by_the_topics_names(tmp_path):
+    ticks = np.round(2000.0 * (TIME - TIME[0])) * 10.0
+    shown = (ticks + 2**15) % 2**16 - 2**15
+    wheels = [
+        [
+            Message(topic, "std_msgs/msg/Int16", {"data": int(n)}, t)
+            for n, t in zip(shown, TIME.tolist(), strict=True)
+        ]
+        for topic in ("/right_ticks", "/left_ticks", "/left_battery")
+    ]
+    poses = [one for one in messages() if one.topic == "/where"]
+    path = write_bag(tmp_path / "bag", "mcap", in_order(*wheels, poses))
+    draft = propose(path, {"drive": "differential", "ticks_per_revolution": "4000"})
+    layout = tomllib.loads(new_config(draft, "mine.toml").text)["layouts"]["mine"]
+    assert layout["topics"]["wheel_ticks"]["topics"] == ["/left_ticks", "/right_ticks"]
+    assert layout["tick_bits"] == 16
+    assert any("/left_ticks, /right_ticks (std_msgs/msg/Int16)" in s for s in draft.sentences)
+    (run,) = runs_of(path, declared_bag_layout(layout, "layout"))
+    turned = run.signals["wheel_ticks"].values
+    np.testing.assert_array_equal(turned - turned[0], np.column_stack([ticks, ticks]))

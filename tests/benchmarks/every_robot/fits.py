@@ -1,4 +1,4 @@
-"""What slipid makes of a robot's logs: `slipid identify`, and `slipid validate` on fresh runs."""
+"""What slipid makes of a robot's logs: calibration, `slipid identify`, and `slipid validate`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from slipid.app.config import read_config
+from slipid.app.problem import read_fit_task
+from slipid.fitting.calibration import calibrate
+from slipid.search_space import Space
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import Judged
+from tests.benchmarks.every_robot.rivals import Kinematics
 from tests.benchmarks.every_robot.robots import MadeRobot
 from tests.benchmarks.every_robot.score import numbers, true
 from tests.helpers.shared import invoke
@@ -23,7 +32,7 @@ class Answer:
     Attributes:
         verdict: verdict of trust, or why there is none.
         rows: errors, keyed by slip model.
-        inside: whether the 90 % interval of each number holds the true one.
+        inside: whether the 90 % interval of each number of the motors holds the true one.
         selected: slip model that slipid selects on each floor.
     """
 
@@ -31,6 +40,36 @@ class Answer:
     rows: Rows = field(default_factory=dict)
     inside: dict[str, bool] = field(default_factory=dict)
     selected: dict[str, str] = field(default_factory=dict)
+
+
+def calibration(robot: MadeRobot, folder: Path) -> dict | str:
+    """Section `calibration` of identified.json, made without the rest of a fit, or why not."""
+    if not robot.readable:
+        return "config not readable yet"
+    try:
+        with Reporter(quiet=True) as report:
+            task = read_fit_task(read_config(folder / "robot.toml"), folder / "logs", report)
+        space = Space(task.robot, task.choices)
+        return calibrate(task.dataset, space, task.choices).to_json()
+    except DataError as error:
+        return f"refused: {str(error).replace(str(folder), '')}"
+
+
+def kinematics(content: dict) -> Kinematics:
+    """The numbers of a section `calibration`, for the judge."""
+    floors = content["surfaces"]
+    length = "effective_base_m" if "base_m" in content["nominal"] else "effective_track_m"
+    centre = dict.fromkeys(floors, 0.0)
+    centre |= {floor: of["value"] for floor, of in content["centre_of_rotation_m"].items()}
+    x, y = (of["value"] for of in content["pose_offset_m"])
+    return Kinematics(
+        {f: np.array([r["value"] for r in of["rolling_radius_m"]]) for f, of in floors.items()},
+        {f: of[length]["value"] for f, of in floors.items()},
+        centre,
+        (x, y),
+        content["pose_yaw_rad"]["value"],
+        content["pose_lag_s"]["value"],
+    )
 
 
 def answer(robot: MadeRobot, folder: Path, truth: dict[str, Judged]) -> Answer:
@@ -43,8 +82,6 @@ def answer(robot: MadeRobot, folder: Path, truth: dict[str, Judged]) -> Answer:
     run = json.loads((out / "run.json").read_text(encoding="utf-8"))
     verdict = (content.get("trust") or run["trust"])["verdict"]
     inside = covered_motors(robot, content["parameters"])
-    if "calibration" in content:
-        inside |= covered(robot, content["calibration"])
     selected = content.get("selected_model", {})
     file = out / "validation.json"
     done = invoke("validate", out, "--data", folder / "fresh", "--json", file, "--quiet")

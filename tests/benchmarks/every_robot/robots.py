@@ -124,6 +124,11 @@ class MadeRobot:
     mass: float = 10.0
 
     @property
+    def readable(self) -> bool:
+        """Whether `slipid identify` fits the robot at all; it refuses steered robots yet."""
+        return self.drive != "steered"
+
+    @property
     def drives(self) -> int:
         return len(self.floors[0].radius)
 
@@ -225,7 +230,7 @@ ROBOTS = (
         wheel_noise=0.003,
     ),
     MadeRobot(
-        "diff_coarse_ticks",
+        "diff_coarse_ticks",  # least squares finds a lag of 0.4 rows here, and there is none
         "differential",
         (alike("floor", 0.0335, 2, 0.152),),
         0.0325,

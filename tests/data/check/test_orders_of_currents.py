@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from slipid.data.check.sanity import findings
+from slipid.data.runs import collect
 from tests.helpers.plain_robot import MECANUM, OMNI, as_runs, drive
 
 KINDS = ("current", "voltage")
@@ -40,3 +41,11 @@ def test_another_order_is_named(robot, order, remedy):
 def test_the_right_order_is_none():
     assert found(OMNI, 0, 1, 2) == []
     assert found(MECANUM, 0, 1, 2, 3) == []
+
+
+def test_torques_may_have_sizes_that_currents_have_not():
+    runs = as_runs([replace(raw, current=1e-4 * raw.current) for raw in drive(OMNI, runs=8)])
+    torques = [replace(log, current_is_torque=True, voltage=None) for log in runs.logs]
+    said = [[f.kind for f in findings(r, OMNI.geometry, 12.0)] for r in (runs, collect(torques))]
+    assert "current_unit" in said[0]
+    assert "current_unit" not in said[1]

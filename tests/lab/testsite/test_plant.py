@@ -17,8 +17,9 @@ from slipid.lab.testsite.driving import (
     named_runs,
     straight,
 )
+from slipid.lab.testsite.motors import MotorBuild, SpeedLoop, WheelDrives
+from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.plant import SimulatedRobot
-from slipid.lab.testsite.robot_build import MotorBuild, RobotBuild, SpeedLoop, WheelDrives
 from slipid.lab.testsite.sections import (
     CurveRuns,
     HeadingRuns,
@@ -31,12 +32,12 @@ from slipid.lab.testsite.surfaces import GRAVITY, LEVELS, SURFACES, SurfacePhysi
 from tests.helpers.floors import surface_at
 
 EVEN = {name: replace(g, unevenness=0.0) for name, g in SURFACES.items()}
-CENTRED = replace(RobotBuild(), centres_m={"as_built": (0.0, 0.0)})
+CENTRED = replace(OmniBuild(), centres_m={"as_built": (0.0, 0.0)})
 STILL = [0.0, 0.0, 0.0]
 
 
 def standing(
-    surface: str, robot: RobotBuild = CENTRED, seed: int = 0, **more: SurfacePhysics
+    surface: str, robot: OmniBuild = CENTRED, seed: int = 0, **more: SurfacePhysics
 ) -> SimulatedRobot:
     grounds = {**EVEN, **more}
     return SimulatedRobot(Site(robot, surfaces=grounds), uniform(surface), "as_built", seed=seed)
@@ -67,7 +68,7 @@ def body_step(trace: Trace) -> np.ndarray:
     return np.array([c * dx + s * dy, c * dy - s * dx, trace.pose[-1, 2] - trace.pose[0, 2]])
 
 
-def rolled(trace: Trace, robot: RobotBuild) -> np.ndarray:
+def rolled(trace: Trace, robot: OmniBuild) -> np.ndarray:
     """What the encoders say of it, integrated along the way."""
     steps = np.diff(trace.wheel_angle, axis=0) @ np.linalg.pinv(robot.wheel_from_twist).T
     heading = np.cumsum(steps[:, 2]) - 0.5 * steps[:, 2]
@@ -76,7 +77,7 @@ def rolled(trace: Trace, robot: RobotBuild) -> np.ndarray:
     return np.array([x.sum(), y.sum(), steps[:, 2].sum()])
 
 
-def slip(trace: Trace, robot: RobotBuild) -> float:
+def slip(trace: Trace, robot: OmniBuild) -> float:
     far, wheels = body_step(trace)[:2], rolled(trace, robot)[:2]
     return float(1 - np.hypot(*far) / np.hypot(*wheels))
 
@@ -122,17 +123,17 @@ def test_a_coasting_robot_only_loses_energy(surface):
 
 @pytest.mark.slow
 def test_the_floor_carries_the_weight_as_statics_say():
-    plant = standing("firm", RobotBuild())
-    rim = RobotBuild().wheel_from_twist @ np.array([0.1, 0.05, 0.0])
+    plant = standing("firm", OmniBuild())
+    rim = OmniBuild().wheel_from_twist @ np.array([0.1, 0.05, 0.0])
     found = []
     for _ in range(4000):
         plant.step(rim.tolist())
         found.append(loads(plant))
-    weight = RobotBuild().mass_kg * GRAVITY
+    weight = OmniBuild().mass_kg * GRAVITY
     mean = np.mean(found[500:], axis=0)
     assert mean.sum() == pytest.approx(weight, rel=0.01)
     # while it stands, where on its two rows of rollers a wheel rests moves a share by up to .02
-    np.testing.assert_allclose(mean / weight, RobotBuild().load_share("as_built"), atol=0.012)
+    np.testing.assert_allclose(mean / weight, OmniBuild().load_share("as_built"), atol=0.012)
 
 
 @pytest.mark.nightly
@@ -237,7 +238,7 @@ def test_a_map_acts_up_to_its_edges():
 
 def test_the_centre_of_mass_is_where_it_is_put_also_with_uneven_wheels():
     robot = replace(
-        RobotBuild(), wheel_azimuths_deg=(0.0, 90.0, 210.0), centres_m={"as_built": (0.01, 0.01)}
+        OmniBuild(), wheel_azimuths_deg=(0.0, 90.0, 210.0), centres_m={"as_built": (0.01, 0.01)}
     )
     plant = standing("firm", robot)
     mujoco.mj_comPos(plant.model, plant.data)
@@ -267,7 +268,7 @@ def test_compaction_and_body_drag_slow_a_robot():
 
 
 def test_what_is_added_to_the_engine_only_takes_energy():
-    plant = standing("soft", RobotBuild())
+    plant = standing("soft", OmniBuild())
     rng = np.random.default_rng(0)
     twists = [[0.0, 0.0, 0.5], [0.2, 0.0, 0.0], *rng.uniform(-0.3, 0.3, (20, 3))]
     for vx, vy, turn in twists:
@@ -409,12 +410,12 @@ def test_the_same_seed_drives_the_same_run():
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: RobotBuild(rollers=7), r"rollers\s+Input should be a multiple of 2"),
-        (lambda: RobotBuild(roller_radius_m=0.05), "roller_radius_m = 0.05 is not less than wheel"),
-        (lambda: RobotBuild(mass_kg=1.0), "less than the mass of the wheels"),
-        (lambda: RobotBuild(centres_m={"far": (0.2, 0.0)}), "centres_m.far: the centre of mass"),
+        (lambda: OmniBuild(rollers=7), r"rollers\s+Input should be a multiple of 2"),
+        (lambda: OmniBuild(roller_radius_m=0.05), "roller_radius_m = 0.05 is not less than wheel"),
+        (lambda: OmniBuild(mass_kg=1.0), "less than the mass of the wheels"),
+        (lambda: OmniBuild(centres_m={"far": (0.2, 0.0)}), "centres_m.far: the centre of mass"),
         (
-            lambda: RobotBuild(wheel_azimuths_deg=(0.0, 90.0)),
+            lambda: OmniBuild(wheel_azimuths_deg=(0.0, 90.0)),
             r"wheel_azimuths_deg\s+Tuple should have at least 3",
         ),
         (

@@ -8,7 +8,7 @@ import pytest
 from slipid.data.reading.presets import declared_layout, preset
 from slipid.data.write import OPTIONAL, own_columns, own_csv, robotino2022_csv
 from slipid.lab.testsite.driving import Trace, straight
-from slipid.lab.testsite.robot_build import RobotBuild
+from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.simulate import log_of
 from slipid.lab.testsite.site import Site, SiteSensors
 from tests.helpers.made_logs import LAYOUT
@@ -48,7 +48,7 @@ def trace():
 
 
 def seen(trace, sensors, seed=0):
-    site = Site(RobotBuild(marker_yaw_deg=float(np.degrees(-0.02))), sensors=sensors)
+    site = Site(OmniBuild(marker_yaw_deg=float(np.degrees(-0.02))), sensors=sensors)
     run = straight("soft", "as_built", 0.0, 0.1, 1.0)
     return log_of(trace, site, run, "as_built/soft/run000", seed)
 

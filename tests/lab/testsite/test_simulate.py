@@ -20,7 +20,7 @@ from slipid.cli.main import app
 from slipid.data.floor_map import four_zones, read_map
 from slipid.data.reading.presets import declared_layout, preset
 from slipid.lab.testsite.config import all_filmed, can_identify, identify_config, plan
-from slipid.lab.testsite.robot_build import RobotBuild
+from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.simulate import SiteTask, _log_path, simulate, truth
 from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.lab.testsite.studio import MARKER, Studio, film
@@ -213,7 +213,7 @@ def test_the_configs_that_ship_are_good(path):
         (("friction = 0.7", 'colour = "#8f9194"'), "maps.zones: two surfaces have the same colour"),
         (
             ("gyro = true", "current_is_signed = true"),
-            "formats: robotino2022 is only for three wheels",
+            "formats: robotino2022 is only for three omni wheels",
         ),
         (
             ("[maps]", '[robot]\ncentres_m = { "../x" = [0, 0] }\n[maps]'),
@@ -444,7 +444,7 @@ def test_the_marker_is_detected_where_the_camera_projects_it(studio):
         found, numbers, _ = detector.detectMarkers(image)
         assert numbers is not None
         assert numbers.ravel().tolist() == [MARKER]
-        np.testing.assert_allclose(found[0][0], corners(pose, RobotBuild(), HALF), atol=1.2)
+        np.testing.assert_allclose(found[0][0], corners(pose, OmniBuild(), HALF), atol=1.2)
 
 
 @pytest.mark.slow
@@ -468,7 +468,7 @@ def test_light_changes_and_motion_smears(studio):
 
     bright = [studio.exposed(t, still).mean() for t in np.arange(0.0, 8.0, 1.0)]
     assert np.ptp(bright) > 0.03 * np.mean(bright)
-    x, y = corners(still(0.0)[0], RobotBuild(), HALF).mean(axis=0).round().astype(int)
+    x, y = corners(still(0.0)[0], OmniBuild(), HALF).mean(axis=0).round().astype(int)
     sharp, smeared = (
         np.diff(studio.exposed(0.0, where)[y - 30 : y + 30, x - 30 : x + 30, 1].astype(float))
         for where in (still, moving)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from slipid.data.reading.bag.definitions import MessageType, definition_of
 from slipid.data.reading.bag.shape import MessageShape, shape_of
 from slipid.data.reading.bag.storage import OPENABLE, BagFiles, RepairedMcap, files_of, repaired
+from slipid.data.reading.bag.ulog import UlogConnection, UlogReader, require_pyulog, ulog_reader
 from slipid.support.errors import DataError, bad_data
 
 if TYPE_CHECKING:
@@ -17,11 +18,13 @@ if TYPE_CHECKING:
     import rosbags.rosbag1
     import rosbags.rosbag2
 
-Reader: TypeAlias = "rosbags.rosbag1.Reader | rosbags.rosbag2.Reader"
+Reader: TypeAlias = "rosbags.rosbag1.Reader | rosbags.rosbag2.Reader | UlogReader"
+Connection: TypeAlias = "rosbags.interfaces.Connection | UlogConnection"
 _REMEDY = {
     "rosbag1": "run: rosbag reindex {file}",
     "sqlite3": "save what is left with: sqlite3 {file} .recover | sqlite3 whole.db3",
     "mcap": "save what is left with: mcap recover {file} -o whole.mcap",
+    "ulog": "download {file} from the robot again",
 }
 _METADATA = "copy the folder again, or run: ros2 bag reindex {file}"
 
@@ -33,12 +36,13 @@ class BagTopic:
     Attributes:
         bag: the bag.
         name: name of the topic.
-        connections: connections of the topic in the package rosbags, one for each publisher.
+        connections: connections of the topic in the package rosbags, one for each publisher, or
+            that of a ULog file.
     """
 
     bag: "OpenBag"
     name: str
-    connections: "tuple[rosbags.interfaces.Connection, ...]"
+    connections: tuple[Connection, ...]
 
     @cached_property
     def type(self) -> str:
@@ -53,7 +57,11 @@ class BagTopic:
     @cached_property
     def message(self) -> MessageType:
         """Definition of the messages' type; raises `DataError` if there is none."""
-        carried = [one.msgdef for one in self.connections]
+        if isinstance(known := self.connections[0].msgdef, MessageType):
+            return known
+        carried = [
+            one.msgdef for one in self.connections if not isinstance(one.msgdef, MessageType)
+        ]
         first = next((one for one in carried if one.format.value), carried[0])
         where = f"{self.bag.files.path} topic '{self.name}'"
         return definition_of(where, self.type, first, self.bag.definitions)
@@ -68,7 +76,9 @@ class BagTopic:
         `number` is the number of the message in the topic, from 1.
         """
         try:
-            return shape_of(data, self.message, cdr=self.bag.files.storage != "rosbag1")
+            return shape_of(
+                data, self.message, cdr=self.bag.files.storage not in ("rosbag1", "ulog")
+            )
         except ValueError as error:
             found = f"the message is no {self.message.name}: {error}"
             expected = "messages that match their definition; is the bag damaged?"
@@ -91,7 +101,8 @@ class OpenBag:
 
     Attributes:
         files: files of the bag.
-        readers: readers of the package rosbags, one for each part that is read separately.
+        readers: readers of the package rosbags, one for each part that is read separately, or that
+            of a ULog file.
         notes: defects of the files that were worked around, one sentence each.
         definitions: folder of .msg files, for types whose definition the bag lacks, or None.
     """
@@ -104,7 +115,7 @@ class OpenBag:
     @cached_property
     def topics(self) -> dict[str, BagTopic]:
         """All topics, keyed by name."""
-        found: dict[str, list[rosbags.interfaces.Connection]] = {}
+        found: dict[str, list[Connection]] = {}
         for reader in self.readers:
             for connection in reader.connections:
                 found.setdefault(connection.topic, []).append(connection)
@@ -203,12 +214,15 @@ def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Re
     """Return an open reader of a file or folder; raise `DataError` if it is damaged."""
     from rosbags import rosbag1, rosbag2
 
+    pyulog = require_pyulog(files.path) if files.storage == "ulog" else None
     try:
+        if pyulog is not None:
+            return ulog_reader(files.path, pyulog)
         if files.storage == "rosbag1":
             return stack.enter_context(rosbag1.Reader(files.path))
         # `RepairedMcap` has the methods of a path that rosbags calls.
         return stack.enter_context(rosbag2.Reader(cast(Path, path)))
-    except Exception as error:  # rosbags raises many types of errors on damaged bytes
+    except Exception as error:  # rosbags and pyulog raise many types on damaged bytes
         raise damage_error(files, error) from error
 
 

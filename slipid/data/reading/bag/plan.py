@@ -19,20 +19,29 @@ from slipid.support.errors import DataError, bad_data, did_you_mean, first_names
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _JOINT_ARRAYS = {"position": "rad", "velocity": "rad/s", "effort": None}
-_KNOWN: dict[str, dict[str, tuple[str, str]]] = {
-    "sensor_msgs/msg/Imu": {"gyro": ("angular_velocity.z", "rad/s")},
-    "sensor_msgs/msg/BatteryState": {"bus_voltage": ("voltage", "V"), "current": ("current", "A")},
+_KNOWN: dict[str, dict[str, tuple[tuple[str, ...], str]]] = {
+    "sensor_msgs/msg/Imu": {"gyro": (("angular_velocity.z",), "rad/s")},
+    "sensor_msgs/msg/BatteryState": {
+        "bus_voltage": (("voltage",), "V"),
+        "current": (("current",), "A"),
+    },
     # The packages robotino_msgs and rto_msgs have the same two types, which are therefore listed
     # without a package.
     "MotorReadings": {
-        "motor_speed": ("velocities", "rpm"),
-        "wheel_ticks": ("positions", "tick"),
-        "current": ("currents", "A"),
+        "motor_speed": (("velocities",), "rpm"),
+        "wheel_ticks": (("positions",), "tick"),
+        "current": (("currents",), "A"),
     },
-    "PowerReadings": {"bus_voltage": ("voltage", "V"), "current": ("current", "A")},
+    "PowerReadings": {"bus_voltage": (("voltage",), "V"), "current": (("current",), "A")},
+    # of PX4, whose first wheel is the right one
+    "wheel_encoders": {
+        "wheel_angle": (("wheel_angle[1]", "wheel_angle[0]"), "rad"),
+        "wheel_speed": (("wheel_speed[1]", "wheel_speed[0]"), "rad/s"),
+    },
+    "battery_status": {"bus_voltage": (("voltage_v",), "V")},
 }
-"""Path and unit of known fields, keyed by message type and then by channel. A type is named without
-its package if several packages have a copy of it."""
+"""Paths and unit of known fields, keyed by message type and then by channel. A type is named
+without its package if several packages have a copy of it."""
 _INSIDE = {
     "pose": ("pose.pose.", "pose.", "transform.", ""),
     "twist_command": ("twist.twist.", "twist.", ""),
@@ -44,6 +53,8 @@ _FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("position.x", "position.y", *(f"orientation.{axis}" for axis in _AXES)),
         ("translation.x", "translation.y", *(f"rotation.{axis}" for axis in _AXES)),
         ("x", "y", "theta"),
+        ("x", "y", "heading"),
+        ("position[0]", "position[1]", "q[1]", "q[2]", "q[3]", "q[0]"),
     ),
     "twist_command": (("linear.x", "linear.y", "angular.z"),),
 }
@@ -177,8 +188,8 @@ def is_transforms(message: MessageType) -> bool:
     return "transforms.transform.translation.x" in message.paths
 
 
-def _known(message: MessageType) -> dict[str, tuple[str, str]]:
-    """Return path and unit of the known fields of a type, keyed by channel."""
+def _known(message: MessageType) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Return paths and unit of the known fields of a type, keyed by channel."""
     return _KNOWN.get(message.name) or _KNOWN.get(message.name.rsplit("/", 1)[-1], {})
 
 
@@ -225,7 +236,7 @@ def _field_pick(channel: str, spec: TopicChannel, topic: BagTopic) -> tuple[Pick
     """
     message = topic.message
     known = _known(message)
-    paths: tuple[str, ...] = spec.fields or known.get(channel, ())[:1]
+    paths = spec.fields or known.get(channel, ((), ""))[0]
     if not paths and message.name.startswith("std_msgs/") and "data" in message.paths:
         paths = ("data",)
     if not paths:
@@ -241,7 +252,8 @@ def _field_pick(channel: str, spec: TopicChannel, topic: BagTopic) -> tuple[Pick
         if message.paths[plain].startswith("text"):
             found = f"field '{path}' of {message.name} is a string"
             raise topic.error(found, "a field with numbers")
-    units = (unit for known_path, unit in known.values() if known_path == paths[0].split("[")[0])
+    plain = paths[0].split("[")[0]
+    units = (unit for inside, unit in known.values() if inside[0].split("[")[0] == plain)
     unit = spec.unit or next(units, None)
     if unit is None:
         expected = f'unit = the unit of its numbers, such as "{CHANNELS[channel]}"'

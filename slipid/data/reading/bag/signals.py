@@ -27,6 +27,8 @@ LARGEST_NUMBER = 1e30
 """Larger magnitudes cannot be measurements in any unit and mean that the bag is damaged."""
 TILT_NOTED = np.radians(20.0)
 """A larger tilt of a pose is noted, since the z axis may not point up [rad]."""
+_DOWN = ("vehicle_local_position", "vehicle_odometry", "vehicle_visual_odometry")
+"""Types of messages of PX4, whose x points north, y east and z down."""
 _RECEIVED = 'to use the time of receipt set stamp = "received"'
 
 
@@ -284,6 +286,9 @@ def group_signals(
     else:
         samples = whole_signal(cleaned(checked_stream(streams[0]), layout, notes), notes)
     values = _planar(samples, notes) if plan.channel == "pose" else samples.values
+    if (topic := streams[0].topic).type in _DOWN:
+        values = values * [1.0, -1.0, -1.0]
+        notes.append(f"topic {topic.name}: y and heading were reversed, since its z points down")
     # Each signal needs a column name for error messages: a heading that is computed from a
     # quaternion gets the name of the quaternion, and the signals of a composed pose share a name.
     named = samples.source.columns

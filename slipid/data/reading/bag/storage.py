@@ -11,20 +11,30 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from slipid.data.reading.containers import refuse_other
 from slipid.support.errors import bad_data, first_names
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
-Storage = Literal["rosbag1", "sqlite3", "mcap"]
-EXPECTED = "a bag: a .bag file, a .db3 or .mcap file, or the folder that ros2 bag record wrote"
+Storage = Literal["rosbag1", "sqlite3", "mcap", "ulog"]
+EXPECTED = (
+    "a bag: a .bag file, a .db3 or .mcap file, the folder that ros2 bag record wrote, or a .ulg "
+    "file of PX4"
+)
 OPENABLE = "a bag that can be opened; check its permissions"
 _MAGIC: dict[Storage, bytes] = {
     "rosbag1": b"#ROSBAG V",
     "sqlite3": b"SQLite format 3\0",
     "mcap": b"\x89MCAP0\r\n",
+    "ulog": b"ULog\x01\x12\x35",
 }
-_SUFFIX: dict[Storage, str] = {"rosbag1": ".bag", "sqlite3": ".db3", "mcap": ".mcap"}
+_SUFFIX: dict[Storage, str] = {
+    "rosbag1": ".bag",
+    "sqlite3": ".db3",
+    "mcap": ".mcap",
+    "ulog": ".ulg",
+}
 
 
 @dataclass(frozen=True)
@@ -103,6 +113,7 @@ def _storage_of(path: Path) -> Storage:
                 expected = f"the suffix of this format; rename it to {path.stem}{_SUFFIX[storage]}"
                 raise bad_data(path, f"a {storage} bag", expected)
             return storage
+    refuse_other(path)
     raise bad_data(path, f"not a bag (it starts with {start[:8]!r})", EXPECTED)
 
 

@@ -29,6 +29,8 @@ _SELF_EXPLAINED = (
     "gyro",
     "bus_voltage",
     "wheel_ticks",
+    "wheel_angle",
+    "wheel_speed",
     "motor_speed",
     "current",
 )

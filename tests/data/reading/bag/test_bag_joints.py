@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.support.errors import DataError
+from slipid.data.reading.assemble import assembled
 from tests.helpers.made_bags import (
     joint_states,
 )
@@ -80,7 +80,26 @@ def test_what_effort_may_mean(tmp_path, channel, unit, factor):
     np.testing.assert_allclose(run.signals[channel].values, ANGLE * factor)
 
 
-def test_a_torque_needs_what_makes_a_current_of_it():
-    topics = {"motor_torque": {"topic": "/joint_states", "field": "effort", "unit": "N*m"}}
-    with pytest.raises(DataError, match="a torque channel without torque_constant"):
-        layout(topics=topics)
+@pytest.mark.parametrize(
+    ("channel", "constant", "amount"),
+    [
+        ("wheel_torque", None, 1.0),
+        ("motor_torque", None, 16.0),
+        ("wheel_torque", 0.05, 1 / (16.0 * 0.05)),
+        ("motor_torque", 0.05, 1 / 0.05),
+    ],
+)
+def test_torques_are_currents_where_their_constant_is_known(tmp_path, channel, constant, amount):
+    messages = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE, effort=ANGLE)
+    at = {"topic": "/joint_states", "field": "effort"}
+    topics = {
+        "wheel_angle": {"topic": "/joint_states"},
+        channel: at | {"unit": "N*m"},
+        "voltage": at | {"unit": "V"},
+    }
+    more = {} if constant is None else {"torque_constant": constant}
+    run = read(bag(tmp_path, "mcap", messages), topics=topics)
+    log = assembled(run, layout(topics=topics, gear_ratio=16.0, **more))
+    np.testing.assert_allclose(log.current, amount * ANGLE)
+    assert log.current_is_torque == (constant is None)
+    assert (log.voltage is None) == (constant is None)

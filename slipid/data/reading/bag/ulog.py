@@ -1,0 +1,104 @@
+"""Topics and messages of a ULog file (PX4), in the form in which those of bags are read.
+
+A message of a ULog file is packed like a message of ROS 1 whose arrays have fixed lengths, so the
+same code finds the numbers in both. The package pyulog reads the file.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slipid.data.reading.bag.definitions import ArrayType, FieldType, MessageType
+from slipid.support.errors import bad_data
+
+_DTYPES = {
+    **{f"int{8 * size}_t": f"i{size}" for size in (1, 2, 4, 8)},
+    **{f"uint{8 * size}_t": f"u{size}" for size in (1, 2, 4, 8)},
+    **{"float": "f4", "double": "f8", "bool": "b1", "char": "u1"},
+}
+_PADDING = "_padding"
+
+
+@dataclass(frozen=True, eq=False)
+class UlogConnection:
+    """Messages of one topic; the attributes are those of a connection of rosbags.
+
+    Attributes:
+        topic: name of the topic, with `:1` for its second instance.
+        msgtype: name of the format of the messages, such as `wheel_encoders`.
+        msgdef: type of the messages.
+        rows: numbers of the messages, each a row as in the file.
+    """
+
+    topic: str
+    msgtype: str
+    msgdef: MessageType
+    rows: np.ndarray
+
+    @property
+    def msgcount(self) -> int:
+        """Return the number of messages."""
+        return len(self.rows)
+
+
+@dataclass(frozen=True, eq=False)
+class UlogReader:
+    """All topics of a ULog file; the methods are those of a reader of rosbags."""
+
+    connections: Sequence[UlogConnection]
+
+    def messages(
+        self, connections: Sequence[UlogConnection]
+    ) -> Iterator[tuple[UlogConnection, int, bytes]]:
+        """Yield the connection, the time [ns] and the bytes of each message.
+
+        Times are counted from the start of the robot.
+        """
+        for one in connections:
+            raw, size = one.rows.tobytes(), one.rows.itemsize
+            for k, stamp in enumerate(one.rows["timestamp"].tolist()):
+                yield one, 1000 * stamp, raw[k * size : (k + 1) * size]
+
+
+def require_pyulog(path: Path) -> Any:
+    """Return the package pyulog; raise `DataError` if it is missing."""
+    try:
+        import pyulog
+    except ImportError as error:
+        expected = "the package pyulog, which reads such files; run: pip install 'slipid[ulog]'"
+        raise bad_data(path, "a ULog file", expected) from error
+    return pyulog
+
+
+def ulog_reader(path: Path, pyulog: Any) -> UlogReader:
+    """Return the reader of a ULog file; pyulog raises many types of errors on damaged bytes."""
+    with path.open("rb") as file:
+        log = pyulog.ULog(file)
+    return UlogReader([_connection(one, log.message_formats) for one in log.data_list])
+
+
+def _connection(one: Any, formats: Mapping[str, Any]) -> UlogConnection:
+    """Return the connection of one topic of pyulog."""
+    names = [field.field_name for field in one.field_data]
+    rows = np.empty(len(one.data["timestamp"]), [(name, one.data[name].dtype) for name in names])
+    for name in names:
+        rows[name] = one.data[name]
+    fields = _type(one.name, formats).fields
+    # the file has no padding at the end of a message
+    while fields and next(reversed(fields)).startswith(_PADDING):
+        fields.popitem()
+    topic = one.name if one.multi_id == 0 else f"{one.name}:{one.multi_id}"
+    return UlogConnection(topic, one.name, MessageType(one.name, fields), rows)
+
+
+def _type(name: str, formats: Mapping[str, Any]) -> MessageType:
+    """Return the type of messages with a format, with its nested types."""
+
+    def field(kind: str, count: int) -> FieldType:
+        element = _DTYPES[kind] if kind in _DTYPES else _type(kind, formats)
+        return ArrayType(element, count) if count else element
+
+    return MessageType(name, {key: field(kind, n) for kind, n, key in formats[name].fields})
