@@ -139,7 +139,7 @@ def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
     wrong = [text for _, text in said if text]
     assert wrong[0] == (
         "'skidd': no such drive, did you mean skid?; "
-        "expected one of omni, mecanum, skid, differential, general"
+        "expected one of omni, mecanum, skid, differential, steered, general"
     )
     assert wrong[1:] == ["'-1': expected a number above 0", "'wide': expected a number"]
     assert not [asks for asks, _ in said if "azimuth" in asks or "stand" in asks]

@@ -26,6 +26,8 @@ def steered_findings(data: Runs, shape: Geometry) -> Iterator[Finding]:
     parts = [_motions(data, run, shape, late) for run in range(len(data))]
     ahead, turned, rolled, steered = np.concatenate(parts).T
     travel, turning = _ratio(ahead, rolled), _ratio(turned, steered)
+    if turning is not None and travel is not None:
+        turning = turning / travel
     if travel is None:
         yield _not_checked("the poses do not follow the wheels, or no run drives ahead")
     elif travel < 0:
@@ -50,11 +52,10 @@ def steered_findings(data: Runs, shape: Geometry) -> Iterator[Finding]:
             "reverse the sign of scale for the channel steering_angle (positive is to the left), "
             "or for the channel pose_heading if its angles grow clockwise",
         )
-    elif not NATURAL[0] < turning / (travel or 1.0) < NATURAL[1]:
+    elif not NATURAL[0] < turning < NATURAL[1]:
         yield Finding(
             "steering_scale",
-            f"the body turns {turning / (travel or 1.0):.3g} times as fast as steering angle and "
-            "wheelbase say",
+            f"the body turns {turning:.3g} times as fast as steering angle and wheelbase say",
             "check wheelbase_m, and the unit of steering_angle, which is that of the wheel, not of "
             "the servo or the steering column (scale = angle of the wheel over the logged one)",
         )
