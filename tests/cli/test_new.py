@@ -59,7 +59,7 @@ def test_no_answer_is_one_clear_error(tmp_path):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("drive", ["omni", "mecanum", "skid", "differential", "general"])
+@pytest.mark.parametrize("drive", ["omni", "mecanum", "skid", "differential", "steered", "general"])
 def test_yes_takes_defaults_and_lists_them(tmp_path, drive):
     out = tmp_path / "mine.toml"
     result = invoke("new", "--out", out, "--drive", drive, "--yes")

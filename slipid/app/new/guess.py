@@ -44,7 +44,11 @@ def guess_robot(
         DataError: an option is not valid, or belongs to another type of drive.
     """
     drive, hint = _likely_drive(wheels, drives_sideways(files))
+    if any(one.find("steering_angle") is not None for one in files):
+        drive, hint = "steered", "a steering angle is logged: steered, with which axle driven?"
     drive = options.get("drive", drive)
+    if drive == "steered" and wheels == 2:
+        options = {"encoders": "2", **options}
     if wheels == 2 and drive in ("mecanum", "skid"):
         options = {"shared": "yes", **options}
     if wheels >= 3 and drive == "omni" and not options.keys() & {"wheels", "azimuths_deg"}:

@@ -9,11 +9,11 @@ of their steps, whose square is a quadratic form of the turns of the wheels:
 
     |moved_k|^2 = sum_ij B_ij turned_i turned_j + b + e_k
 
-with turned_i short for the difference above, and b for the noise of positions. The speed must change during the motion, because
-steady motion looks the same at any offset. A search compares offsets by the unexplained fraction of
-the motion; near the best offset, `linearised` gives the derivatives with respect to offset and
-drift under a noise model, in which e is the sum of pose noise, which successive steps share, and of
-slip, which is independent in each step.
+with turned_i short for the difference above, and b for the noise of positions. The speed must
+change during the motion, because steady motion looks the same at any offset. A search compares
+offsets by the unexplained fraction of the motion; near the best offset, `linearised` gives the
+derivatives with respect to offset and drift under a noise model, in which e is the sum of pose
+noise, which successive steps share, and of slip, which is independent in each step.
 """
 
 from collections.abc import Sequence

@@ -71,6 +71,7 @@ def assembled(run: RawRun, layout: SensorLayout) -> Log:
         duty=held.get("duty"),
         bus_voltage=held["bus_voltage"][:, 0] if "bus_voltage" in held else None,
         gyro=held["gyro"][:, 0] if "gyro" in held else None,
+        steering=_steering(signals.get("steering_angle"), clock),
         pose=pose,
         pose_fresh=fresh,
         notes=tuple(remarks),
@@ -107,6 +108,18 @@ def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray
         at = np.searchsorted(signal.time[there], clock, side="right") - 1
         out[:, k] = column[there][at.clip(0)]
     return out
+
+
+def _steering(
+    signal: Signal | None, clock: Float[np.ndarray, " time"]
+) -> Float[np.ndarray, " time"] | None:
+    """Return the steering angle at each time [rad], linear between its readings."""
+    if signal is None:
+        return None
+    there = ~np.isnan(signal.values[:, 0])
+    if not there.any():
+        raise signal.source.error("no values", "at least one number", column=0)
+    return np.interp(clock, signal.time[there], signal.values[there, 0])
 
 
 def _fresh(

@@ -26,6 +26,7 @@ _LIMITS = {
     # about the wrong one of these two.
     "voltage": (1000.0, "V"),
     "gyro": (100.0, "rad/s"),
+    "steering": (3.2, "rad"),
 }
 
 
@@ -159,6 +160,7 @@ _NAMES = {
     "wheel_speed_command": ("wheel_speed_command", "motor_speed_command"),
     "current": ("current", "motor_torque", "wheel_torque"),
     "voltage": ("voltage", "duty"),
+    "steering": ("steering_angle",),
 }
 """Channels of a file from which a channel of the log may be computed, keyed by the channel of the
 log."""

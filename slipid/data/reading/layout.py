@@ -41,6 +41,7 @@ SINGLE = {
     "twist_command_yaw": "rad/s",
     "bus_voltage": "V",
     "gyro": "rad/s",
+    "steering_angle": "rad",
     "pose_x": "m",
     "pose_y": "m",
     "pose_heading": "rad",
