@@ -136,8 +136,8 @@ def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -
             found = f"the {what} jumps by {jumps[i]:.3g} {unit}"
             key = "max_pose_jump" if unit == "m" else "max_heading_jump"
             expected = (
-                f"at most {limit:.3g} {unit} between poses; another marker, or wrong unit? If poses "
-                f"are rare, raise {key} of the layout"
+                f"at most {limit:.3g} {unit} between poses; another marker, or wrong unit? If "
+                f"poses are rare, raise {key} of the layout"
             )
             raise UnusablePose(str(_at(log, signals, column, int(rows[i + 1]), 0, found, expected)))
     turned = np.ptp(log.wheel_angle, axis=0).max(initial=0.0)
