@@ -158,8 +158,8 @@ def _compared(
     evidence = gather(geometry, at, moved)
     if not evidence.pose:
         note = _not_checked(
-            "the poses have positions alone, headings alone or the ends of runs alone: order, signs "
-            "and sizes of the wheels are not compared with them"
+            "the poses have positions alone, headings alone or the ends of runs alone: order, "
+            "signs and sizes of the wheels are not compared with them"
         )
         return _Compared((*_of_lag(lag), note), moved, evidence)
     declared = agreement(data, at, moved, evidence, Interpretation())
