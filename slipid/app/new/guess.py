@@ -148,7 +148,7 @@ class SortedFiles:
 def sort_files(path: Path) -> SortedFiles:
     """Return the log files at a path, sorted.
 
-    If the path is a file without wheels or without whole poses, other files in its folder are added.
+    If the path is a file without wheels or whole poses, other files in its folder are added.
     """
     formats, no_logs = formats_below(path) if path.is_dir() else ([format_of(path)], {})
     presets, others, hints = [], [], []
