@@ -101,6 +101,30 @@ class DifferentialDrive(WheeledDrive):
     track_m: Positive
 
 
+class SteeredDrive(WheeledDrive):
+    """Wheels that are steered: bicycle, tricycle or car (Ackermann); x counts from the rear axle.
+
+    The logs need the channel `steering_angle`. Such a robot is calibrated, but has no force
+    balance.
+
+    Attributes:
+        wheelbase_m: distance between the rear axle and the steered front axle.
+        driven: axle whose wheels have the encoders, "rear" or "front".
+        encoders: number of encoders on this axle, of which the mean counts.
+    """
+
+    drive: Literal["steered"]
+    wheelbase_m: Positive
+    driven: Literal["rear", "front"] = "rear"
+    encoders: Literal[1, 2] = 1
+
+    @model_validator(mode="after")
+    def _one_axle(self) -> "SteeredDrive":
+        if self.drives is not None:
+            raise ValueError("drives is given; expected encoders = 1 or 2 on the driven axle")
+        return self
+
+
 class GeneralDrive(WheeledDrive):
     """Any arrangement of wheels, described by their centres, drive directions and roller angles.
 
@@ -140,7 +164,7 @@ class BenchMotors(Section):
     names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]] = Field(default_factory=list)
 
 
-Wheels = OmniDrive | FourWheelDrive | DifferentialDrive | GeneralDrive
+Wheels = OmniDrive | FourWheelDrive | DifferentialDrive | SteeredDrive | GeneralDrive
 
 
 class LogsSection(Section):
@@ -419,6 +443,8 @@ def geometry(robot: Wheels) -> Geometry:
     if isinstance(robot, DifferentialDrive):
         robot.drive_of(2)
         return g.differential(robot.track_m / 2, radius, gear)
+    if isinstance(robot, SteeredDrive):
+        return g.steered(robot.wheelbase_m, radius, gear, robot.driven, robot.encoders)
     rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]
     places, shared = robot.wheel_places_m, robot.drive_of(len(robot.wheel_places_m))
     return g.general(places, robot.drive_directions_deg, rollers, radius, gear, shared)

@@ -159,7 +159,11 @@ class FitTask:
         """Return the likelihood of the runs that stay on one floor each.
 
         `near` is a robot close to the optimum, or None; windows are cut for `cutting_robot(near)`.
+
+        Raises:
+            DataError: the robot steers.
         """
+        refuse_steered(self.robot.geometry)
         return Problem(self.windows(self.cutting_robot(near)), self.robot, list(self.choices))
 
     def cutting_robot(self, near: Robot | None) -> Robot:
@@ -198,6 +202,15 @@ class ConfigFitTask(FitTask):
 
     config: Config
     skipped: tuple[str, ...]
+
+
+def refuse_steered(shape: Geometry) -> None:
+    """Raise `DataError` if a wheel is steered, which no force balance describes."""
+    if shape.driven is not None:
+        raise DataError(
+            "no force balance for steered wheels: radius, wheelbase and steering are calibrated "
+            "from poses, and forces, motors and loads are not fitted"
+        )
 
 
 def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask:
@@ -286,10 +299,19 @@ def fit_task(
     logged = dataset.logs[0]
     if shape.drives != logged.wheels:
         drives = f"{shape.drives} drives" if shape.drive_of else f"{shape.wheels} wheels"
-        shared = "; say which wheels share a motor by robot.drives = [[1, 3], [2, 4]]"
+        hint = "; say which wheels share a motor by robot.drives = [[1, 3], [2, 4]]"
+        hint = hint if shape.wheels == 2 * logged.wheels else ""
+        if shape.driven is not None:
+            hint = f"; robot.encoders is the number on the {shape.driven} axle"
         raise DataError(
             f"{config.path}: robot: {drives}, but {logged.name} has {logged.wheels}; expected the "
-            f"same{shared if shape.wheels == 2 * logged.wheels else ''}"
+            f"same{hint}"
+        )
+    if shape.driven is not None and dataset.steering is None:
+        log = next(log for log in dataset.logs if log.steering is None)
+        raise DataError(
+            f"{log.name}: no steering angle; expected the channel steering_angle in the layout of "
+            "every log, since robot.drive is 'steered'"
         )
     robot = robot_for_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out, by_user = _choices(config, robot)

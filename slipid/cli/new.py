@@ -10,7 +10,7 @@ from slipid.cli.common import flag, guarded, option
 if TYPE_CHECKING:
     from slipid.app.new.config_text import NewConfig
 
-_WHEELS = "For omni and general wheels"
+_WHEELS = "For omni, steered and general wheels"
 _BOX = "For mecanum and skid"
 Text = str | None
 
@@ -32,7 +32,7 @@ def new(
     ] = None,
     drive: Annotated[
         Text,
-        _text("Type of the wheels: omni, mecanum, skid, differential or general."),
+        _text("Type of the wheels: omni, mecanum, skid, differential, steered or general."),
     ] = None,
     wheel_radius_m: Annotated[Text, _text("Wheel radius.")] = None,
     gear_ratio: Annotated[Text, _text("Motor turns per wheel turn.")] = None,
@@ -40,13 +40,19 @@ def new(
     ticks_per_revolution: Annotated[
         Text, _text("Encoder ticks per motor turn; 0 if no ticks are logged.")
     ] = None,
-    wheelbase_m: Annotated[Text, _text("Distance between front and rear axle.", _BOX)] = None,
+    wheelbase_m: Annotated[
+        Text, _text("Distance between front and rear axle; also for steered.", _BOX)
+    ] = None,
     track_m: Annotated[
         Text, _text("Distance between left and right wheels; also for a differential drive.", _BOX)
     ] = None,
     shared: Annotated[
         Text, _text("Enter yes if one motor drives both wheels of a side, otherwise no.", _BOX)
     ] = None,
+    driven: Annotated[
+        Text, _text("Steered: axle with the encoders, rear or front.", _WHEELS)
+    ] = None,
+    encoders: Annotated[Text, _text("Steered: number of encoders on it.", _WHEELS)] = None,
     wheels: Annotated[Text, _text("Number of omni wheels.", _WHEELS)] = None,
     azimuths_deg: Annotated[
         Text, _text("Directions of the omni wheels from the middle, such as 60,180,300.", _WHEELS)
@@ -132,8 +138,9 @@ def _show(config: "NewConfig", out: Path, data: str) -> None:
     else:
         typer.echo(f"{out} is complete; run")
     typer.echo(f"  slipid check {out} --data {data}")
-    typer.echo("or, before driving, simulate which parameters a plan of runs would identify:")
-    typer.echo(f"  slipid selftest {out}")
+    if config.simulated:
+        typer.echo("or, before driving, simulate which parameters a plan of runs would identify:")
+        typer.echo(f"  slipid selftest {out}")
 
 
 @guarded

@@ -62,8 +62,10 @@ class Log:
         duty: duty cycle of each motor's bridge [1], or None.
         bus_voltage: supply voltage [V], or None.
         gyro: yaw rate [rad/s], or None.
+        steering: steering angle, positive to the left [rad], linear between readings, or None.
         pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the camera's log (not
-            corrected for a wrong camera scale), or None.
+            corrected for a wrong camera scale), or None; nan in coordinates that were not measured,
+            such as the heading of a satellite receiver or the position of a compass.
         pose_fresh: False where the row repeats the last pose.
         pose_clock: clock offset and drift, estimated from the motion, of poses that have times of
             their own; else None.
@@ -90,6 +92,7 @@ class Log:
     duty: Float[np.ndarray, "time wheel"] | None = None
     bus_voltage: Float[np.ndarray, " time"] | None = None
     gyro: Float[np.ndarray, " time"] | None = None
+    steering: Float[np.ndarray, " time"] | None = None
     pose: Float[np.ndarray, "time 3"] | None = None
     pose_fresh: Bool[np.ndarray, " time"] | None = None
     pose_clock: Clock | None = None
@@ -114,7 +117,8 @@ class Log:
 
     def __repr__(self) -> str:
         """Return one line with the name, size and logged channels."""
-        names = ("wheel_speed", "current", "voltage", "duty", "bus_voltage", "gyro", "pose")
+        electric = ("current", "voltage", "duty", "bus_voltage")
+        names = ("wheel_speed", *electric, "gyro", "steering", "pose")
         has = [name for name in names if getattr(self, name) is not None]
         return (
             f"Log({self.name!r}, {self.samples} rows, {self.duration:.1f} s, {self.wheels} wheels, "

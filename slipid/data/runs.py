@@ -13,6 +13,7 @@ from slipid.data.wheel_signals import (
     MOVED_M,
     bridge_stalls,
     first_moved,
+    integral,
     read_anew,
     refresh_period,
 )
@@ -29,7 +30,9 @@ class Runs:
         offset: index of the first sample of each run; the last element is the number of samples.
         time: time within the run [s] (sample,).
         wheel_angle: angle of each wheel [rad] (sample, wheel), linear across telemetry stalls.
-        pose: x [m], y [m], heading [rad], in the scale of the log.
+        steering: steering angle [rad] (sample,), or None if a run has none.
+        pose: x [m], y [m], heading [rad], in the scale of the log; nan in coordinates that were not
+            measured.
         fresh: False where the row repeats the last camera frame.
         live: False in the rows of a telemetry stall, whose currents are stale.
         current: motor currents [A] (sample, wheel), or None if a run has none.
@@ -51,6 +54,7 @@ class Runs:
     offset: Int[np.ndarray, " runs_and_one"]
     time: Float[np.ndarray, " sample"]
     wheel_angle: Float[np.ndarray, "sample wheel"]
+    steering: Float[np.ndarray, " sample"] | None
     pose: Float[np.ndarray, "sample 3"]
     fresh: Bool[np.ndarray, " sample"]
     live: Bool[np.ndarray, " sample"]
@@ -93,6 +97,18 @@ class Runs:
     def rows(self, run: int) -> slice:
         """Return the slice of the flat arrays that holds one run."""
         return slice(int(self.offset[run]), int(self.offset[run + 1]))
+
+    def turned(self, run: int) -> Float[np.ndarray, "row column"]:
+        """Return the wheel angles [rad] of a run.
+
+        If the steering angle is logged, its integral over time [rad s] and the time [s] follow.
+        """
+        rows = self.rows(run)
+        if self.steering is None:
+            return self.wheel_angle[rows]
+        time = self.time[rows]
+        steered = integral(time, self.steering[rows, None])
+        return np.concatenate([self.wheel_angle[rows], steered, time[:, None]], axis=1)
 
     def subset(self, keep: Iterable[int] | np.ndarray) -> "Runs":
         """Return the runs with the given indices, in the given order."""
@@ -140,12 +156,14 @@ def collect(
                 "torques in all runs, or torque_constant [N m/A] in the layout of the torques"
             )
         if log.pose is None:
-            raise DataError(f"{log.name}: no pose; expected pose columns, which a fit needs")
+            raise DataError(
+                f"{log.name}: no pose; expected columns of x and y, of a heading, or of all three"
+            )
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
     heading, speed, turn = np.array([_command(log) for log in logs]).T
     bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]
     flat: dict[str, np.ndarray] = {}
-    for name in ("time", "pose", "current", "voltage"):
+    for name in ("time", "pose", "current", "voltage", "steering"):
         parts = [getattr(log, name) for log in logs]
         if not any(p is None for p in parts):
             flat[name] = np.concatenate(parts)
@@ -166,6 +184,7 @@ def collect(
         offset=offset,
         time=flat["time"],
         wheel_angle=flat["wheel_angle"],
+        steering=flat.get("steering"),
         pose=flat["pose"],
         fresh=flat["pose_fresh"],
         live=np.concatenate([~stalled for _, stalled in bridged]),
@@ -211,7 +230,7 @@ def _first(lines: Sequence[str], noun: str) -> list[str]:
 
 _CHANNELS = (
     *("wheel_speed", "wheel_speed_command", "twist_command", "current", "voltage"),
-    *("duty", "bus_voltage", "gyro", "pose"),
+    *("duty", "bus_voltage", "gyro", "steering", "pose"),
 )
 """Channels of which the logged ones are listed, in this order."""
 

@@ -104,7 +104,8 @@ def windows(
         longest: largest duration of a window [s]; longer runs have more segments.
 
     Raises:
-        DataError: no wheel of a run moves by `MOVED_M`, or a run has too few poses for its windows.
+        DataError: no wheel of a run moves by `MOVED_M`, or a run has too few poses for its windows,
+            or poses that lack a coordinate.
     """
     each = [_edges(data, k, wheel_radius, lag, per_segment, longest) for k in range(len(data))]
     run = [k for k, segments in enumerate(each) for _ in segments]
@@ -209,6 +210,7 @@ def _edges(
     """
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
+    _require_whole_poses(data, run)
     shown = time[fresh] - lag
     fresh = fresh[(fresh >= first) & (shown >= time[0] - 1e-9) & (shown <= time[-1] + 1e-9)]
     if len(fresh) < per_segment + 1:
@@ -227,6 +229,20 @@ def _edges(
         picked = np.linspace(0, len(fresh) - 1, count + 1).round().astype(int)
     rows = fresh[picked]
     return [rows[k : k + per_segment + 1] for k in range(0, count, per_segment)]
+
+
+def _require_whole_poses(data: Runs, run: int) -> None:
+    """Raise `DataError` if poses of a run lack a coordinate, or if there are at most two."""
+    pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
+    lacking = np.isnan(pose).any(axis=0)
+    what = "without headings" if lacking[2] else "without positions" if lacking.any() else ""
+    if not what and len(pose) > 2:
+        return
+    raise DataError(
+        f"{data.logs[run].name}: poses {what or f'in {len(pose)} rows only'}; expected x, y and "
+        "heading during the run, which a fit of motors and contact needs. Kinematics alone can be "
+        "calibrated: slipid identify --only calibration"
+    )
 
 
 def _cut(

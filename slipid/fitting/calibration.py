@@ -7,6 +7,9 @@ Every fit begins with these numbers (see `slipid.model.kinematics` for the equat
     track or base on floor k         b_k = b exp(f_k)
     centre of rotation on floor k    x_k, for more than two wheels that point ahead; 0 on the
                                      firmest floor, since only its distance from the sensor shows
+    wheelbase on floor k             l_k = l exp(f + f_k) of a robot that steers, f_k = 0 on the
+                                     firmest floor; its drives have one radius
+    steering                         zero, gain and understeer, equal on all floors
     pose sensor                      place p, yaw psi (with a deviation for every session), lag, and
                                      scale of the positions
 
@@ -14,6 +17,10 @@ They minimise the squared whitened innovations of all poses (`slipid.fitting.inn
 weighted by a Student t, plus a Gaussian prior. The variances of poses and motion are estimated by
 maximum likelihood in turn. Intervals are from a jackknife over runs, since the kinematics are wrong
 somewhere and errors of a run are alike; they are at least as wide as those of the likelihood.
+
+Straight driving tells the steering's zero, and turns tell gain over wheelbase. Gain and wheelbase
+apart follow from large angles alone, by the tangent, so that both have priors: the config's
+wheelbase within 5 %, and a gain of 1 within .1.
 
 Source: least squares for the same numbers on square paths, Borenstein and Feng 1996, "Measurement
 and correction of systematic odometry errors in mobile robots" (UMBmark), IEEE Transactions on
@@ -26,6 +33,7 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Literal
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import minimize
@@ -43,7 +51,8 @@ from slipid.fitting.innovations import (
     sensor_yaw,
     start_headings,
 )
-from slipid.model.kinematics import Kinematics, is_axle, nominal_base
+from slipid.model.geometry import Geometry
+from slipid.model.kinematics import Kinematics, Steering, is_axle, nominal_base
 from slipid.model.robot import Robot
 from slipid.parameter import as_numbers
 from slipid.search_space import Choice, Space
@@ -56,6 +65,16 @@ RADIUS_STD, DRIVE_STD, FLOOR_STD, DRIVE_ON_FLOOR_STD, BASE_STD = 0.3, 0.05, 0.3,
 """Prior stds of the logarithms of the radius, of the drives' deviations from it, of a floor's
 radius over that of the firmest floor, of the drives' further deviations on a floor, and of the
 track or base over the config's [1]."""
+WHEELBASE_STD, WHEELBASE_ON_FLOOR_STD, ZERO_STD, GAIN_STD, UNDERSTEER_STD = (
+    0.05,
+    0.15,
+    0.1,
+    0.1,
+    0.03,
+)
+"""Prior stds of the logarithm of a steered robot's wheelbase over the config's on the firmest floor
+and of that on other floors over it [1], of the steering's zero [rad], of its gain [1], and of the
+understeer [s^2/m], of which soft tyres have .03."""
 LAG_STD, YAW_STD, SESSION_STD = 0.3, 0.5, 0.02
 """Prior stds of the lag [s], of the sensor's yaw and of its deviation in a session [rad]."""
 LOOSE_SCALE_STD = 0.01
@@ -136,6 +155,7 @@ class Calibration:
         lag: lag of the poses behind the wheels [s].
         scale: true over logged length [1].
         firmest: floor with the largest radius, to which the centre and other radii refer.
+        steering: numbers of a robot that steers, keyed as in identified.json; empty for others.
         nominal_radius, nominal_base: lengths of the config [m].
         noise: stds of poses and motion.
         runs: number of calibrated runs.
@@ -151,6 +171,7 @@ class Calibration:
     lag: Value
     scale: Value
     firmest: str
+    steering: Mapping[str, Value]
     nominal_radius: float
     nominal_base: float
     noise: MotionNoise
@@ -167,20 +188,40 @@ class Calibration:
             names = (
                 ["left", "right"] if len(radii) == 2 else [str(j + 1) for j in range(len(radii))]
             )
+            names, radii = (["mean"], radii[:1]) if self.steering else (names, radii)
             each = ", ".join(f"{n} {_mm(v)}" for n, v in zip(names, radii, strict=True))
-            what = "base" if self.sideways else "track"
+            what = "base" if self.sideways else "wheelbase" if self.steering else "track"
             ratio = self.multipliers[floor][1]
             line = f"{floor}: wheel radius {each}; effective {what} {_mm(self.base[floor])}"
             line += f", {ratio:.3f} of nominal"
             if floor in self.centre and self.centre[floor].verdict != "fixed":
                 line += f"; turns about a point {_mm(self.centre[floor])} ahead of the middle"
             lines.append(line)
+        if self.steering:
+            lines.append(self._of_steering())
         x, y = self.offset
         lines.append(
             f"pose sensor {_mm(x)} ahead and {_mm(y)} left of the middle, turned by "
             f"{np.degrees(self.yaw.value):.2f} deg; poses are {1e3 * self.lag.value:.0f} ms late"
         )
         return tuple(lines)
+
+    def _of_steering(self) -> str:
+        """Return a line about the steering, which says what only priors tell."""
+        zero, gain, understeer = (self.steering[n] for n in ("zero_rad", "gain", "understeer"))
+        line = (
+            f"steering: straight ahead at {np.degrees(zero.value):.2f} deg, gain {gain.value:.3f}, "
+            f"understeer {understeer.value:.4f} s^2/m"
+        )
+        if gain.verdict != "identified" or self.base[self.firmest].verdict != "identified":
+            ratio = gain.value / self.base[self.firmest].value
+            line += (
+                f"; of gain and wheelbase the runs tell little but their ratio, {ratio:.3f} per m"
+                ": drive curves at large steering angles"
+            )
+        if understeer.verdict == "not_identified":
+            line += "; understeer is not identified: drive the same curves slowly and fast"
+        return line
 
     def numbers(self, floor: str) -> Float[np.ndarray, " number"]:
         """Return log radius ratios of the drives, log base ratio, and centre [m] on a floor.
@@ -226,7 +267,9 @@ class Calibration:
 
     def to_json(self) -> Content:
         """Return the section `calibration` of identified.json, which `of_json` reads."""
-        length = "effective_base_m" if self.sideways else "effective_track_m"
+        has_track = not self.sideways and not self.steering
+        length = "effective_track_m" if has_track else "effective_base_m"
+        steering = {name: asdict(value) for name, value in self.steering.items()}
         return {
             "surfaces": {
                 floor: {
@@ -241,6 +284,7 @@ class Calibration:
             "pose_session_yaw_rad": dict(self.session_yaw),
             "pose_lag_s": asdict(self.lag),
             "pose_scale": asdict(self.scale),
+            **({"steering": steering} if steering else {}),
             "multipliers": {
                 floor: {"wheel_radius": list(radius), "track": base}
                 for floor, (radius, base) in self.multipliers.items()
@@ -262,11 +306,11 @@ class Calibration:
             return {floor: (a, b, c) for floor, (a, b, c) in x.items()}
 
         floors, noise = content["surfaces"], content["noise"]
-        sideways = "base_m" in content["nominal"]
-        length = "base_m" if sideways else "track_m"
+        steering = content.get("steering", {})
+        length = "base_m" if "base_m" in content["nominal"] else "track_m"
         x, y = content["pose_offset_m"]
         return cls(
-            sideways=sideways,
+            sideways=length == "base_m" and not steering,
             radius={f: tuple(value(v) for v in of["rolling_radius_m"]) for f, of in floors.items()},
             base={f: value(of[f"effective_{length}"]) for f, of in floors.items()},
             centre={f: value(v) for f, v in content["centre_of_rotation_m"].items()},
@@ -276,6 +320,7 @@ class Calibration:
             lag=value(content["pose_lag_s"]),
             scale=value(content["pose_scale"]),
             firmest=content["firmest"],
+            steering={name: value(v) for name, v in steering.items()},
             nominal_radius=content["nominal"]["wheel_radius_m"],
             nominal_base=content["nominal"][length],
             noise=MotionNoise(
@@ -292,6 +337,11 @@ def _mm(length: Value) -> str:
     if length.verdict == "not_identified":
         return f"{text} (not identified)"
     return text if length.verdict == "fixed" else f"{text} +- {1e3 * half:.2g}"
+
+
+def _base_names(floor: str) -> tuple[str, ...]:
+    """Return the names of the coordinates whose sum is log b_k / b."""
+    return "base", f"base.{floor}"
 
 
 def _radius_names(floor: str, drive: int) -> tuple[str, ...]:
@@ -316,7 +366,8 @@ class _Model:
         floors, sessions: names of floors and sessions.
         firmest: index of the floor to which radii refer.
         numbers: coordinates of the search vector, keyed by name.
-        unseen: names of coordinates that no run shows, and that stay at their prior means.
+        unseen: names of coordinates that no run shows, such as the track without turns, or the
+            radius without positions; they stay at their prior means.
     """
 
     space: Space
@@ -335,13 +386,21 @@ class _Model:
         loose = scale.std > LOOSE_SCALE_STD * scale.mean
         size = max(nominal_base(shape), 0.1)
         numbers = {"radius": _Number(0.0, 0.0 if loose else RADIUS_STD)}
-        numbers |= {f"drive.{j}": _Number(0.0, DRIVE_STD) for j in range(shape.drives)}
+        drives = range(shape.drives if shape.driven is None else 0)
+        numbers |= {f"drive.{j}": _Number(0.0, DRIVE_STD) for j in drives}
         others = [f for k, f in enumerate(floors) if k != firmest]
         numbers |= {f"floor.{f}": _Number(0.0, FLOOR_STD) for f in others}
         if others:
-            own = {f"drive.{j}@{f}" for f in floors for j in range(shape.drives)}
+            own = {f"drive.{j}@{f}" for f in floors for j in drives}
             numbers |= {name: _Number(0.0, DRIVE_ON_FLOOR_STD) for name in sorted(own)}
-        numbers |= {f"base.{f}": _Number(0.0, BASE_STD) for f in floors}
+        if shape.driven is None:
+            numbers |= {f"base.{f}": _Number(0.0, BASE_STD) for f in floors}
+        else:
+            numbers["base"] = _Number(0.0, WHEELBASE_STD)
+            numbers |= {f"base.{f}": _Number(0.0, WHEELBASE_ON_FLOOR_STD) for f in others}
+            numbers["zero"] = _Number(0.0, ZERO_STD)
+            numbers["gain"] = _Number(1.0, GAIN_STD)
+            numbers["understeer"] = _Number(0.0, UNDERSTEER_STD)
         if not shape.determines_twist and not is_axle(shape):
             numbers |= {f"centre.{f}": _Number(0.0, size) for f in others}
         place = np.asarray(space.template.camera.marker_place)
@@ -353,10 +412,19 @@ class _Model:
             numbers |= {f"yaw@{s}": _Number(0.0, SESSION_STD) for s in sessions}
         numbers["lag"] = _given(space, choices, "camera.lag", LAG_STD)
         numbers["scale"] = scale
-        straight = set(floors) - _floors_with_turns(space, data)
+        # Steering that is off its zero turns a robot that seems to drive straight ahead.
+        straight = set(floors) - _floors_with_turns(space, data) if shape.driven is None else set()
         unseen = {f"{what}.{f}" for f in straight for what in ("base", "centre")}
         if straight == set(floors):
             unseen |= {"offset.x", "offset.y"}
+        seen = np.isfinite(data.pose[data.fresh]).any(axis=0)
+        if not seen[0]:
+            # Headings alone show ratios of lengths, so the config's radius counts as known.
+            unseen |= {"radius", "offset.x", "offset.y", "scale", *(f"floor.{f}" for f in others)}
+        if not seen[2]:
+            unseen |= {"yaw", *(f"yaw@{s}" for s in sessions)}
+        if max(int(data.fresh[data.rows(k)].sum()) for k in range(len(data))) < 3:
+            unseen.add("lag")
         unseen &= set(numbers)
         return cls(space, floors, sessions, firmest, numbers, frozenset(unseen))
 
@@ -386,15 +454,31 @@ class _Model:
         radius = np.array(
             [[sum(self.column(n, z) for n in _radius_names(f, j)) for j in drives] for f in floors]
         )
-        base = np.stack([self.column(f"base.{f}", z) for f in floors], axis=-1)
+        base = [sum(self.column(n, z) for n in _base_names(f)) for f in floors]
+        base = self.nominal_base * np.exp(np.stack(base, axis=-1))
         return Kinematics(
             floors,
             self.rolling,
             self.nominal_base,
             float(shape.wheel_radius) * np.exp(np.moveaxis(radius, (0, 1), (-2, -1))),
-            self.nominal_base * np.exp(base),
+            base,
             np.stack([self.column(f"centre.{f}", z) for f in floors], axis=-1),
+            self.steering(z, base),
         )
+
+    def steering(
+        self, z: Float[np.ndarray, "*batch free"], base: Float[np.ndarray, "*batch floor"]
+    ) -> Steering | None:
+        """Return the steering on every floor at a search vector; None if no wheel is steered."""
+        driven = self.space.template.geometry.driven
+        if driven is None:
+            return None
+        zero, gain, understeer = (
+            np.broadcast_to(self.column(name, z)[..., None], base.shape)
+            for name in ("zero", "gain", "understeer")
+        )
+        front = np.full(base.shape, float(driven == "front"))
+        return Steering(base, zero, gain, understeer, front)
 
     def matrices(
         self, z: Float[np.ndarray, "*batch free"]
@@ -422,6 +506,14 @@ def _floors_with_turns(space: Space, data: Runs) -> set[str]:
         heading = data.wheel_angle[data.rows(k)] @ yaw
         turned.setdefault(log.surface or "unknown", []).append(float(np.ptp(heading)))
     return {f for f, x in turned.items() if max(x) > WHOLE_TURN or np.mean(x) > MEAN_TURN}
+
+
+def _nominal(shape: Geometry) -> tuple[Float[np.ndarray, "3 drive"], Steering | None]:
+    """Return the matrix from wheel turns to body increments, and the steering, by the config."""
+    matrix = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
+    if shape.driven is None:
+        return matrix, None
+    return matrix, Steering(nominal_base(shape), 0.0, 1.0, 0.0, float(shape.driven == "front"))
 
 
 def _is_fixed(choices: Sequence[Choice], path: str) -> bool:
@@ -487,12 +579,15 @@ class _Fit:
             return np.broadcast_to(model.column(name, z)[..., None], each.shape)
 
         place = np.stack([for_all("offset.x"), for_all("offset.y")], axis=-1)
+        kinematics = model.kinematics(z)
+        steering = kinematics.steering
         return Motion(
-            matrix=model.matrices(z)[..., self.floor, :, :],
+            matrix=kinematics.matrices()[..., self.floor, :, :],
             place=place,
             yaw=for_all("yaw") + each,
             scale=for_all("scale"),
             lag=for_all("lag") - self.tracks.lag,
+            steering=steering and Steering(*(x[..., self.floor] for x in steering)),
         )
 
     def log_noise(self, log_variance: Float[np.ndarray, " variance"]) -> np.ndarray:
@@ -505,7 +600,8 @@ class _Fit:
         """Arrays of the tracks for the compiled functions."""
         t, now = self.tracks, self.motion(self.z)
         turn = t.turn + now.lag[:, None, None, None] * t.turn_slope
-        heading = np.asarray(start_headings(now.matrix, t.pose, turn)) + now.yaw
+        aligned = start_headings(now.matrix, t.pose, turn, now.steering)
+        heading = np.asarray(aligned) + now.yaw
         return t.pose, t.turn, t.turn_slope, t.far, heading
 
     @cached_property
@@ -522,7 +618,8 @@ class _Fit:
         free, step = len(self.z), 1e-6
         moved = self.motion(self.z + step * np.eye(free))
         total = np.zeros((*white.shape, free))
-        for field, before, after in zip(slope, now, moved, strict=True):
+        leaves = (jax.tree.leaves(each) for each in (slope, now, moved))
+        for field, before, after in zip(*leaves, strict=True):
             by_z = (after - before) / step
             shape = *white.shape, -1
             by_field = np.asarray(field).reshape(shape)
@@ -684,9 +781,9 @@ def _in_stds(
 def _cut(fit: _Fit) -> _Fit:
     """Return the fit with the tracks cut at the present lag."""
     shape = fit.model.space.template.geometry
-    nominal = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
+    nominal, steering = _nominal(shape)
     arm, lag = 0.5 * nominal_base(shape), float(fit.model.column("lag", fit.z))
-    tracks = pose_tracks(fit.data, lag, nominal, arm)
+    tracks = pose_tracks(fit.data, lag, nominal, arm, steering)
     return replace(fit, tracks=tracks, weight=np.ones(len(tracks.pose)))
 
 
@@ -698,8 +795,9 @@ def _started(model: _Model, data: Runs, z: np.ndarray, log_variance: np.ndarray)
     tracks = fit.tracks
     if "yaw" not in model.free or not np.isfinite(tracks.pose).all(axis=-1).any():
         return fit
-    z = z.copy()
-    z[model.free.index("yaw")] = sensor_yaw(fit.motion(z).matrix, tracks.pose, tracks.turn)
+    z, now = z.copy(), fit.motion(z)
+    yaw = sensor_yaw(now.matrix, tracks.pose, tracks.turn, now.steering)
+    z[model.free.index("yaw")] = yaw
     return replace(fit, z=z)
 
 
@@ -717,6 +815,9 @@ def _referred(fit: _Fit, choices: Sequence[Choice], firmest: int) -> _Fit:
     shift = {"radius": longer, "offset.x": -ahead}
     shift |= {f"floor.{f}": -longer for f in model.floors}
     shift |= {f"centre.{f}": -ahead for f in model.floors}
+    if "base" in model.numbers:
+        shift |= {"base": before(f"base.{own}")}
+        shift |= {f"base.{f}": -before(f"base.{own}") for f in model.floors}
     z = np.array([before(name) + shift.get(name, 0.0) for name in model.free])
     return replace(fit, model=model, z=z)
 
@@ -753,15 +854,14 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
     def value(names: Sequence[str], unit: str, log_of: float | None = None) -> Value:
         """Return the sum of some coordinates, or the exponential of the sum, times `log_of`."""
         w = np.array([float(name in names) for name in model.free])
-        prior = float(
-            np.hypot.reduce(
-                [model.numbers[name].std for name in names if name in model.numbers], initial=0.0
-            )
-        )
+        stds = {name: model.numbers[name].std for name in names if name in model.numbers}
+        prior = float(np.hypot.reduce([*stds.values()], initial=0.0))
+        hidden = [std for name, std in stds.items() if name in model.unseen]
         at = sum(float(model.column(name, z)) for name in names)
         influence = (off @ w) ** 2
         jackknife = (count - 1) / count * float(influence.sum())
-        std = float(np.sqrt(max(float(w @ covariance @ w), jackknife))) if w.any() else prior
+        std = float(np.sqrt(max(float(w @ covariance @ w), jackknife)))
+        std = float(np.hypot.reduce([std, *hidden])) if w.any() else prior
         share = influence / max(float(influence.sum()), 1e-300)
         freedom = max(1 / max(float((share**2).sum()), 1e-9) - 1, 3.0)
         half = std * float(student.ppf(0.95, freedom))
@@ -777,13 +877,19 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
 
     shape = model.space.template.geometry
     radius, base = float(shape.wheel_radius), nominal_base(shape)
+    steering = {
+        "wheelbase_m": value(_base_names(model.floors[model.firmest]), "m", base),
+        "zero_rad": value(["zero"], "rad"),
+        "gain": value(["gain"], "1"),
+        "understeer": value(["understeer"], "s^2/m"),
+    }
     return Calibration(
         sideways=shape.determines_twist,
         radius={
             f: tuple(value(_radius_names(f, j), "m", radius) for j in range(shape.drives))
             for f in model.floors
         },
-        base={f: value([f"base.{f}"], "m", base) for f in model.floors},
+        base={f: value(_base_names(f), "m", base) for f in model.floors},
         centre={f: value([f"centre.{f}"], "m") for f in model.floors if model.has_centre},
         offset=(value(["offset.x"], "m"), value(["offset.y"], "m")),
         yaw=value(["yaw"], "rad"),
@@ -791,6 +897,7 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         lag=value(["lag"], "s"),
         scale=value(["scale"], "1"),
         firmest=model.floors[model.firmest],
+        steering={} if shape.driven is None else steering,
         nominal_radius=radius,
         nominal_base=base,
         noise=_noise(fit),

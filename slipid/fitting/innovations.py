@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
+from slipid.model.kinematics import Steering, rolled
 from slipid.support.errors import DataError
 
 POSE_PERIOD_S = 0.2
@@ -52,7 +53,8 @@ class PoseTracks(NamedTuple):
         run: index of the run of each track; tracks that only fill the arrays come last and have
             none.
         pose: logged poses [m, m, rad]; nan where a coordinate is unknown.
-        turn: wheel turns in the steps between poses at the lag `lag` [rad].
+        turn: wheel turns in the steps between poses at the lag `lag` [rad]; a robot that steers has
+            two more columns (see `slipid.model.kinematics.rolled`).
         turn_slope: their derivative with respect to the lag [rad/s].
         far: distance between poses, with which errors of the motion grow [m].
         lag: lag of the poses for which the turns were computed [s].
@@ -60,8 +62,8 @@ class PoseTracks(NamedTuple):
 
     run: Int[np.ndarray, " run"]
     pose: Float[np.ndarray, "track pose 3"]
-    turn: Float[np.ndarray, "track gap step drive"]
-    turn_slope: Float[np.ndarray, "track gap step drive"]
+    turn: Float[np.ndarray, "track gap step column"]
+    turn_slope: Float[np.ndarray, "track gap step column"]
     far: Float[np.ndarray, "track gap"]
     lag: float
 
@@ -76,7 +78,11 @@ class PoseTracks(NamedTuple):
 
 
 def pose_tracks(
-    data: Runs, lag: float, nominal: Float[np.ndarray, "3 drive"], arm: float
+    data: Runs,
+    lag: float,
+    nominal: Float[np.ndarray, "3 drive"],
+    arm: float,
+    steering: Steering | None = None,
 ) -> PoseTracks:
     """Return the poses of runs whose true times, earlier by `lag` [s], have wheel angles.
 
@@ -85,6 +91,7 @@ def pose_tracks(
         lag: lag of the poses behind the wheels [s].
         nominal: matrix from wheel turns [rad] to body increments by which distances are computed.
         arm: distance that a yaw of 1 rad counts as [m].
+        steering: numbers of a robot that steers by which distances are computed; else None.
 
     Raises:
         DataError: no run has two such poses.
@@ -111,17 +118,18 @@ def pose_tracks(
     at = (time[:, :-1, None] + between[..., None] * part).reshape(tracks, -1)
     at = np.concatenate([at, time[:, -1:]], axis=1)
 
+    columns = [data.wheel_angle[data.rows(k)] if steering is None else data.turned(k) for k in kept]
+
     def turned(lag: float) -> np.ndarray:
-        out = np.zeros((tracks, count, steps, data.wheel_angle.shape[1]))
+        out = np.zeros((tracks, count, steps, columns[0].shape[1]))
         for n, k in enumerate(kept):
-            of = data.rows(k)
-            angle = interpolate(data.time[of], data.wheel_angle[of], at[n] - lag)
+            angle = interpolate(data.time[data.rows(k)], columns[n], at[n] - lag)
             out[n] = np.diff(angle, axis=0).reshape(out[n].shape)
         return out
 
     turn = turned(lag)
     slope = (turned(lag + LAG_STEP_S) - turned(lag - LAG_STEP_S)) / (2 * LAG_STEP_S)
-    step = np.einsum("ad,rgsd->rga", nominal, turn)
+    step = rolled(nominal, turn, steering).sum(axis=2)
     far = np.hypot(step[..., 0], step[..., 1]) + arm * np.abs(step[..., 2])
     return PoseTracks(np.array(kept), pose, turn, slope, far, lag)
 
@@ -155,6 +163,7 @@ class Motion(NamedTuple):
         yaw: heading of the sensor less that of the body [rad].
         scale: true over logged length [1].
         lag: lag of the poses less the lag of the tracks [s].
+        steering: numbers of a robot that steers; else None.
     """
 
     matrix: Any
@@ -162,6 +171,7 @@ class Motion(NamedTuple):
     yaw: Any
     scale: Any
     lag: Any
+    steering: Steering | None = None
 
 
 class Innovations(NamedTuple):
@@ -177,13 +187,15 @@ class Innovations(NamedTuple):
 
 
 def moved(
-    matrix: Float[Array, "3 drive"], turn: Float[Array, "gap step drive"]
+    matrix: Float[Array, "3 drive"],
+    turn: Float[Array, "gap step column"],
+    steering: Steering | None,
 ) -> Float[Array, "gap 3"]:
     """Return the motion of the body between poses, relative to its pose before [m, m, rad].
 
     Each step is an arc.
     """
-    step = turn @ matrix.T
+    step = rolled(matrix, turn, steering)
     yaw = jnp.cumsum(step[..., 2], axis=-1)
     middle, chord = yaw - 0.5 * step[..., 2], jnp.sinc(step[..., 2] / (2 * jnp.pi))
     c, s = jnp.cos(middle) * chord, jnp.sin(middle) * chord
@@ -214,7 +226,7 @@ def _innovations(
         return jnp.concatenate([place, heading[None], jnp.zeros(3)]), offset
 
     def steps(n: Motion) -> Array:
-        return moved(n.matrix, turn + n.lag * slope)
+        return moved(n.matrix, turn + n.lag * slope, n.steering)
 
     state, _ = start(numbers)
     at, offset = start(reference)
@@ -362,7 +374,8 @@ def loss_of_noise(
 def start_headings(
     matrix: Float[Array, "track 3 drive"],
     pose: Float[Array, "track pose 3"],
-    turn: Float[Array, "track gap step drive"],
+    turn: Float[Array, "track gap step column"],
+    steering: Steering | None = None,
 ) -> Float[Array, " track"]:
     """Return the body's heading at the start of every track that aligns its path with its poses.
 
@@ -370,8 +383,8 @@ def start_headings(
     fewer than two positions, the result is zero.
     """
 
-    def one(matrix: Array, pose: Array, turn: Array) -> Array:
-        motion = moved(matrix, turn)
+    def one(matrix: Array, pose: Array, turn: Array, steering: Steering | None) -> Array:
+        motion = moved(matrix, turn, steering)
         yaw = jnp.concatenate([jnp.zeros(1), jnp.cumsum(motion[:, 2])])
         step = (motion[:, 0] + 1j * motion[:, 1]) * jnp.exp(1j * yaw[:-1])
         path = jnp.concatenate([jnp.zeros(1), jnp.cumsum(step)])
@@ -382,16 +395,17 @@ def start_headings(
         place = jnp.where(seen, place - place.sum() / count, 0.0)
         return jnp.angle((place * path.conj()).sum())
 
-    return jax.vmap(one)(matrix, pose, turn)
+    return jax.vmap(one)(matrix, pose, turn, steering)
 
 
 @jax.jit
 def sensor_yaw(
     matrix: Float[Array, "track 3 drive"],
     pose: Float[Array, "track pose 3"],
-    turn: Float[Array, "track gap step drive"],
+    turn: Float[Array, "track gap step column"],
+    steering: Steering | None = None,
 ) -> Float[Array, ""]:
     """Return the heading of the pose sensor less that of the body, from directions of travel."""
-    motion = jax.vmap(moved)(matrix, turn)
+    motion = jax.vmap(moved)(matrix, turn, steering)
     seen = jnp.diff(pose[..., 0] + 1j * pose[..., 1], axis=1) * jnp.exp(-1j * pose[:, :-1, 2])
     return -jnp.angle(jnp.nansum(seen * (motion[..., 0] - 1j * motion[..., 1])))

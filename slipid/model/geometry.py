@@ -80,6 +80,8 @@ class Geometry(Drives):
         grips: True for an ordinary wheel, False for one with rollers (wheel,).
         drive_of: see `Drives`.
         gear_ratio: n, motor speed over wheel speed.
+        driven: driven axle of a robot that steers, "rear" or "front"; None if no wheel is steered.
+            Its base radius is the wheelbase, and its wheels are those with encoders.
     """
 
     wheel_radius: Array = known("m", "r", "wheel radius", start=0.05, lower=0.0, spread=0.02)
@@ -94,6 +96,7 @@ class Geometry(Drives):
     grips: tuple[bool, ...] = eqx.field(static=True, default=())
     drive_of: tuple[int, ...] = eqx.field(static=True, default=())
     gear_ratio: float = eqx.field(static=True, default=1.0)
+    driven: str | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
         """Raise `ValueError` for rollers that cannot drive and for drives that turn no wheel."""
@@ -314,6 +317,32 @@ def differential(half_track: float, wheel_radius: float, gear_ratio: float = 1.0
     """Return a robot with two ordinary wheels on an axle, left and right, and casters."""
     axle = [(0.0, half_track), (0.0, -half_track)]
     return general(axle, [0.0] * 2, [None] * 2, wheel_radius, gear_ratio)
+
+
+def steered(
+    wheelbase: float, wheel_radius: float, gear_ratio: float, driven: str, encoders: int = 1
+) -> Geometry:
+    """Return a robot that steers, with its origin in the middle of the rear axle.
+
+    Args:
+        wheelbase: distance between the axles [m].
+        wheel_radius: radius of the driven wheels [m].
+        gear_ratio: motor speed over wheel speed.
+        driven: driven axle, "rear" or "front".
+        encoders: number of encoders on that axle; the robot moves by their mean.
+    """
+    return Geometry(
+        wheel_radius=as_numbers(wheel_radius),
+        base_radius=as_numbers(wheelbase),
+        drive_offset=as_numbers(np.zeros(encoders)),
+        radius_deviation=as_numbers(np.zeros(encoders)),
+        place=((1.0 if driven == "front" else 0.0, 0.0),) * encoders,
+        drive_angle=(0.0,) * encoders,
+        roller_angle=(0.5 * math.pi,) * encoders,
+        grips=(True,) * encoders,
+        gear_ratio=float(gear_ratio),
+        driven=driven,
+    )
 
 
 def _corners(a: float, b: float) -> list[tuple[float, float]]:

@@ -15,16 +15,65 @@ axle's middle:
 
     v = mean(r w),  W = (mean_right(r w) - mean_left(r w)) / b_k,  v_y = -x_k W
 
+A robot that steers (bicycle, tricycle, Ackermann) turns by its steering angle delta [rad], with an
+effective wheelbase l_k. Positions count from the middle of the rear axle:
+
+    v = mean(r w), times cos d if the front axle is driven
+    W = v tan(d) / (l_k + K v^2),  d = gain (delta - delta_0)
+
 Source: effective track, the `wheel_separation_multiplier` of ROS controllers; centre of rotation,
-Mandow et al. 2007, IROS; rolling omni wheels, Indiveri 2009, IEEE T-RO 25(1).
+Mandow et al. 2007, IROS; rolling omni wheels, Indiveri 2009, IEEE T-RO 25(1);
+steady turn with understeer, Gillespie 1992, Fundamentals of Vehicle Dynamics, chapter 6.
 """
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.model.geometry import Geometry
+
+
+class Steering(NamedTuple):
+    """Numbers by which a robot turns at a steering angle; arrays have one common shape.
+
+    Attributes:
+        wheelbase: effective wheelbase l [m].
+        zero: logged steering angle delta_0 at which the robot drives straight ahead [rad].
+        gain: steering angle of the wheel over the logged one [1].
+        understeer: K, by which the curvature falls with the speed [s^2/m].
+        front: 1 if the front axle is driven, 0 if the rear axle is.
+    """
+
+    wheelbase: Any
+    zero: Any
+    gain: Any
+    understeer: Any
+    front: Any
+
+
+def rolled(
+    matrix: Float[Any, "3 drive"], turn: Float[Any, "*batch column"], steering: Steering | None
+) -> Float[Any, "*batch 3"]:
+    """Return body increments [m, m, rad] for wheel turns in short steps, of NumPy or JAX.
+
+    Args:
+        matrix: matrix from wheel turns [rad] to body increments, without the turning by steering.
+        turn: wheel turns [rad]; those of a robot that steers are followed by the integral of the
+            steering angle over the step [rad s] and by the duration of the step [s].
+        steering: numbers of a robot that steers, all without axes; else None.
+    """
+    if steering is None:
+        return turn @ matrix.T
+    xp = turn.__array_namespace__()
+    time = turn[..., -1]
+    seconds = xp.where(time > 0, time, 1.0)
+    angle = steering.gain * (turn[..., -2] / seconds - steering.zero)
+    ahead = (turn[..., :-2] @ matrix.T)[..., 0]
+    ahead = ahead * (1 - steering.front * (1 - xp.cos(angle)))
+    radius = steering.wheelbase + steering.understeer * (ahead / seconds) ** 2
+    return xp.stack([ahead, xp.zeros_like(ahead), ahead * xp.tan(angle) / radius], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +85,11 @@ class Kinematics:
         rolling: pseudo-inverse J^+ of the geometry, from rim speeds to the body twist.
         nominal_base: base or track of the geometry that `rolling` belongs to [m].
         radius: effective rolling radius of every drive on every floor [m].
-        base: effective track, or effective base of wheels that determine the twist [m].
+        base: effective track, effective base of wheels that determine the twist, or effective
+            wheelbase of a robot that steers [m].
         centre: point about which the robot turns, ahead of the axle's middle [m]; zero for wheels
             that determine the twist.
+        steering: steering on every floor, or None if no wheel is steered.
     """
 
     labels: tuple[str, ...]
@@ -47,6 +98,7 @@ class Kinematics:
     radius: Float[np.ndarray, "floor drive"]
     base: Float[np.ndarray, " floor"]
     centre: Float[np.ndarray, " floor"]
+    steering: Steering | None = None
 
     def matrices(self) -> Float[np.ndarray, "floor 3 drive"]:
         """Return the matrices from wheel speeds [rad/s] to body twists [m/s, m/s, rad/s]."""
@@ -78,9 +130,11 @@ def matrices(
 def nominal_base(shape: Geometry) -> float:
     """Return the length that the yaw rate of the wheels is inversely proportional to [m].
 
-    It is the track of wheels that point ahead, lx + ly of mecanum wheels, and the distance of omni
-    wheels from the middle.
+    It is the track of wheels that point ahead, lx + ly of mecanum wheels, the distance of omni
+    wheels from the middle, and the wheelbase of a robot that steers.
     """
+    if shape.driven is not None:
+        return float(shape.base_radius)
     arm = np.abs(np.asarray(shape.forward())[:, 2])
     return float(arm.mean()) * (1.0 if shape.determines_twist else 2.0)
 

@@ -41,6 +41,12 @@ CASES = {
     "mecanum": ({**BOX, "shared": "no"}, CORNERS, [0] * 4, 4),
     "skid": ({**BOX, "shared": "yes"}, CORNERS, [0] * 4, 2),
     "differential": ({"track_m": "0.6"}, [(0, 0.3), (0, -0.3)], [0, 0], 2),
+    "steered": (
+        {"wheelbase_m": "0.4", "driven": "front", "encoders": "2"},
+        [(0.4, 0)] * 2,
+        [0, 0],
+        2,
+    ),
     "general": (FOUR, [(0.2, 0.1), (0.2, -0.1), (-0.3, 0)], [0, 0, 90], 3),
 }
 
@@ -86,6 +92,7 @@ def test_a_config_has_only_what_its_drive_has(drive):
         "mecanum": {"half_length_m", "half_width_m"},
         "skid": {"half_length_m", "half_width_m", "drives"},
         "differential": {"track_m"},
+        "steered": {"wheelbase_m", "driven", "encoders"},
         "general": {"wheel_places_m", "drive_directions_deg", "roller_angles_deg"},
     }
     assert set(robot) == common | own[drive]
@@ -132,7 +139,7 @@ def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
     wrong = [text for _, text in said if text]
     assert wrong[0] == (
         "'skidd': no such drive, did you mean skid?; "
-        "expected one of omni, mecanum, skid, differential, general"
+        "expected one of omni, mecanum, skid, differential, steered, general"
     )
     assert wrong[1:] == ["'-1': expected a number above 0", "'wide': expected a number"]
     assert not [asks for asks, _ in said if "azimuth" in asks or "stand" in asks]

@@ -38,6 +38,7 @@ MODELS = (
         c.OmniDrive,
         c.FourWheelDrive,
         c.DifferentialDrive,
+        c.SteeredDrive,
         c.GeneralDrive,
         c.BenchMotors,
         c.LogsSection,
@@ -134,7 +135,7 @@ def test_all_there_is_is_in_it():
     for entry in entries(robot):
         assert f"| `{entry.path}` |" in text
         assert entry.declaration.doc
-    for drive in ("omni", "mecanum", "skid", "differential", "general", "motor"):
+    for drive in ("omni", "mecanum", "skid", "differential", "steered", "general", "motor"):
         assert f'drive = "{drive}"' in text
 
 

@@ -37,7 +37,11 @@ def test_truth_and_rivals_write_the_same_kinematics(robot):
 
 
 @pytest.mark.parametrize(
-    "name", ["omni3_right", "omni4_wrong_base", "mecanum_two_floors", "diff_own", "skid_two_floors"]
+    "name",
+    [
+        *("omni3_right", "omni4_wrong_base", "mecanum_two_floors", "diff_own", "skid_two_floors"),
+        *("tricycle_front", "ackermann_car"),
+    ],
 )
 def test_slipid_reads_the_config_as_the_same_geometry(name, tmp_path):
     robot = NAMED[name]

@@ -12,7 +12,7 @@ from slipid.data.runs import collect
 from slipid.fitting.calibration import Calibration, Value, calibrate
 from slipid.search_space import Choice, Space
 from slipid.support.progress import Reporter
-from tests.benchmarks.every_robot.drive import write
+from tests.benchmarks.every_robot.drive import commands, driven, table, write, write_csv
 from tests.benchmarks.every_robot.fits import covered
 from tests.benchmarks.every_robot.robots import ROBOTS, MadeRobot
 
@@ -102,6 +102,18 @@ def test_positions_without_headings(task_of):
     assert near(found.offset[0], 0.060, 3e-3)
 
 
+def test_headings_alone_show_ratios_of_lengths(task_of):
+    """The config's radius is taken as given; the track over it and the radii's ratio are right."""
+    found = calibrated(task_of(MADE["diff_heading"]))
+    left, right = found.radius["floor"]
+    assert left.verdict == right.verdict == "not_identified"
+    assert np.ptp(left.interval90) > 0.5 * left.value
+    assert left.value / right.value == pytest.approx(0.0505 / 0.0495, rel=2e-3)
+    assert near(found.base["floor"], 0.315, 2e-3)
+    assert [place.verdict for place in found.offset] == ["not_identified"] * 2
+    assert found.lag.verdict == "identified"
+
+
 def test_a_number_that_the_config_fixes_stays(task_of):
     found = calibrated(task_of(MADE["diff_own"]), Choice("camera.lag", fixed=0.02))
     assert found.lag.value == 0.02
@@ -125,3 +137,61 @@ def test_a_run_with_a_wrong_label_has_little_weight(task_of):
         low, high = found.radius[floor][0].interval90
         assert low < radius < high
         assert found.radius[floor][0].value == pytest.approx(radius, rel=5e-3)
+
+
+BICYCLE = MADE["bicycle_zero"]
+FRONT = replace(  # another bicycle with all that steering has, of the same compiled functions
+    BICYCLE,
+    name="front",
+    floors=(replace(BICYCLE.floors[0], understeer=0.02),),
+    driven="front",
+    place=(0.15, 0.02),
+    lag=0.06,
+    speed=1.2,
+)
+
+
+def test_bicycle(task_of):
+    """Zero and gain of the steering; the tangent at 23 degrees tells gain from wheelbase."""
+    found = calibrated(task_of(BICYCLE))
+    assert near(found.radius["floor"][0], 0.033, 5e-5)
+    assert near(found.steering["zero_rad"], -0.035, 5e-4)
+    assert near(found.steering["gain"], 0.9, 0.03)
+    assert near(found.steering["wheelbase_m"], 0.256, 0.01)
+    ratio = found.steering["gain"].value / found.steering["wheelbase_m"].value
+    assert ratio == pytest.approx(0.9 / 0.256, rel=5e-3)
+    steering = found.to_json()["steering"]
+    assert set(steering) == {"wheelbase_m", "zero_rad", "gain", "understeer"}
+    assert steering["wheelbase_m"] == found.to_json()["surfaces"]["floor"]["effective_base_m"]
+
+
+def test_driven_front_axle_with_understeer_and_a_sensor_that_is_late(task_of):
+    found = calibrated(task_of(FRONT))
+    assert near(found.radius["floor"][0], 0.033, 1e-4)
+    assert near(found.steering["zero_rad"], -0.035, 1e-3)
+    assert near(found.steering["understeer"], 0.02, 0.004)
+    assert near(found.offset[0], 0.15, 3e-3)
+    assert near(found.lag, 0.06, 3e-3)
+
+
+@pytest.mark.parametrize("angles", [0.1, 0.0])
+def test_small_steering_angles_do_not_tell_gain_from_wheelbase(tmp_path, angles):
+    """Turns at small angles tell only gain over wheelbase, and one angle not even that."""
+    robot = replace(BICYCLE, name=f"angles {angles}")
+    rng = np.random.default_rng(5)
+    write(replace(robot, runs=1), tmp_path, seed=3)
+    for number in range(robot.runs):
+        legs = commands(robot, rng, number, fresh=False) * [1, 1, 1, angles]
+        run = driven(robot, robot.floors[0], legs, rng)
+        write_csv(tmp_path / "logs" / "floor" / f"{number:02d}.csv", table(robot, run, rng))
+    with Reporter(quiet=True) as report:
+        task = read_fit_task(read_config(tmp_path / "robot.toml"), tmp_path / "logs", report)
+    found = calibrated(task)
+    gain, wheelbase, zero = (found.steering[n] for n in ("gain", "wheelbase_m", "zero_rad"))
+    for number, truth in ((gain, 0.9), (wheelbase, 0.256), (zero, -0.035)):
+        assert number.interval90[0] < truth < number.interval90[1]
+    assert gain.verdict != "identified"
+    assert wheelbase.verdict == "not_identified"
+    if angles:
+        assert zero.interval90[1] - zero.interval90[0] < 2e-3
+        assert gain.value / wheelbase.value == pytest.approx(0.9 / 0.256, rel=0.02)

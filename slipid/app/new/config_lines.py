@@ -131,8 +131,11 @@ def drawing(robot: Geometry) -> str:
 
     The x axis (ahead) points up and the y axis to the left. A wheel is drawn as its number in the
     order of the log columns, an arrow in the direction in which it rolls at a positive speed, and
-    the letter of the motor that it shares with other wheels.
+    the letter of the motor that it shares with other wheels. Of a robot that steers, the axles are
+    drawn.
     """
+    if robot.driven is not None:
+        return _axles(robot)
     lines = [
         "seen from above, arrows: direction of a positive wheel speed",
         "",
@@ -142,6 +145,24 @@ def drawing(robot: Geometry) -> str:
         *_motor_lines(robot),
     ]
     return "\n".join(line.rstrip() for line in lines)
+
+
+def _axles(robot: Geometry) -> str:
+    """Return a drawing of the axles of a robot that steers."""
+    count = robot.drives
+    encoders = f", {count} encoder{'s' if count > 1 else ''}"
+    front, rear = (encoders if robot.driven == axle else "" for axle in ("front", "rear"))
+    lines = [
+        "seen from above, wheels rolling ahead at a positive speed",
+        "",
+        "         ^ x",
+        f"       [ / ]   front axle, steered, positive to the left{front}",
+        "         |",
+        f"         |     wheelbase {float(robot.base_radius):.3f} m",
+        "         |",
+        f"  y <--[ + ]   rear axle, from which x counts{rear}",
+    ]
+    return "\n".join(lines)
 
 
 def direction(degrees: float) -> str:

@@ -14,6 +14,7 @@ _ORDER = {
     "mecanum": "wheels: front left, front right, rear left, rear right",
     "skid": "wheels: front left, front right, rear left, rear right",
     "differential": "wheels: left, right",
+    "steered": "bicycle, tricycle or car; x counts from the rear axle",
     "general": "any wheels",
 }
 _ANSWER_OF_KEY = {
@@ -29,7 +30,7 @@ _ANSWER_OF_KEY = {
 _ASK_MEASURED = "default value: measure it, or look it up"
 _ASK_PLACES = "default value: where do the wheels stand, in the order of the columns?"
 _QUESTIONS = {
-    "drive": "which drive is it: omni, mecanum, skid, differential or general?",
+    "drive": "which drive is it: omni, mecanum, skid, differential, steered or general?",
     "wheel_azimuths_deg": _ASK_PLACES,
     "wheel_places_m": _ASK_PLACES,
     "drive_directions_deg": "default value: which way does each wheel roll?",
@@ -37,6 +38,8 @@ _QUESTIONS = {
     "gear_ratio": "default value: is there a gear, and are speeds and ticks those of the motor?",
     "mass_kg": "default value: weigh the robot",
     "wheel_radius_m": _ASK_MEASURED,
+    "driven": "default value: which axle's wheels have the encoders?",
+    "encoders": "default value: has the driven axle one encoder or two?",
 }
 _DATASHEET = (
     "no motor voltages are logged, so this parameter and the next keep these values: what are they "
@@ -150,11 +153,13 @@ class NewConfig:
         text: text of the file.
         drawing: drawing of the robot.
         questions: open questions in the text.
+        simulated: False for a robot that steers, which `slipid selftest` cannot simulate.
     """
 
     text: str
     drawing: str
     questions: tuple[str, ...]
+    simulated: bool
 
 
 def new_config(draft: ConfigDraft, name: str) -> NewConfig:
@@ -175,10 +180,10 @@ def new_config(draft: ConfigDraft, name: str) -> NewConfig:
         *(block for layout in draft.layouts for block in layout.blocks()),
         *(_logs_block(logs, first=k == 0) for k, logs in enumerate(draft.logs)),
         _FIT,
-        _weights_block(geometry(robot).wheels),
+        *([] if robot.drive == "steered" else [_weights_block(geometry(robot).wheels)]),
         _parameters_block(draft.channels),
     ]
     text = "\n\n".join(block.text() for block in blocks) + "\n"
     parsed(Path(name), text)
     questions = tuple(question for block in blocks for question in block.open_questions)
-    return NewConfig(text, picture, questions)
+    return NewConfig(text, picture, questions, robot.drive != "steered")

@@ -178,7 +178,9 @@ def _channels(answers: RobotAnswers) -> tuple[ConfigLine, ...]:
     labels = ["fl", "fr", "rl", "rr"]
     if answers.drive in ("omni", "general"):
         labels = [str(k + 1) for k in range(answers.wheels)]
-    elif answers.shared or answers.drive == "differential":
+    elif answers.drive == "steered" and answers.encoders == 1:
+        labels = [answers.driven]
+    elif answers.shared or answers.drive in ("differential", "steered"):
         labels = ["left", "right"]
 
     def each(name: str) -> tuple[str, ...]:
@@ -187,11 +189,15 @@ def _channels(answers: RobotAnswers) -> tuple[ConfigLine, ...]:
     ticks = channel_line("wheel_ticks", each("ticks"), "tick", "or wheel_angle, motor_angle")
     speed = channel_line("wheel_speed", each("speed"), "rad/s", "or motor_speed, before the gear")
     sideways = channel_line("twist_command_y", ("command_y",), "m/s")
+    motors = (
+        channel_line("current", each("current"), "A"),
+        channel_line("voltage", each("voltage"), "V", "at the motors, not the battery's"),
+    )
+    steering = channel_line("steering_angle", ("steering",), "rad", "of the wheel, left positive")
     return (
         channel_line("time", ("time",), "s", question=_EXAMPLE_NAMES),
         ticks if answers.ticks_per_revolution else speed,
-        channel_line("current", each("current"), "A"),
-        channel_line("voltage", each("voltage"), "V", "at the motors, not the battery's"),
+        *((steering,) if answers.drive == "steered" else motors),
         channel_line("pose_x", ("x",), "m", "at the rate of its sensor; empty cells between"),
         channel_line("pose_y", ("y",), "m"),
         channel_line("pose_heading", ("heading",), "rad"),

@@ -32,6 +32,8 @@ class RobotAnswers:
     wheelbase_m: float = 0.3
     track_m: float = 0.3
     shared: bool = False
+    driven: str = "rear"
+    encoders: int = 1
     places_m: tuple[tuple[float, ...], ...] = ()
     directions_deg: tuple[float, ...] = ()
     rollers_deg: tuple[float | None, ...] = ()
@@ -75,6 +77,21 @@ def count(text: str, _: RobotAnswers) -> int:
     """Return the number of wheels, from 3 to 12, in an answer."""
     if not text.strip().isdecimal() or not 3 <= int(text) <= 12:
         raise ValueError("expected a whole number from 3 to 12")
+    return int(text)
+
+
+def axle(text: str, _: RobotAnswers) -> str:
+    """Return the driven axle, rear or front, in an answer."""
+    word = text.strip().lower()
+    if word not in ("rear", "front"):
+        raise ValueError("expected rear or front")
+    return word
+
+
+def one_or_two(text: str, _: RobotAnswers) -> int:
+    """Return the number of encoders, 1 or 2, in an answer."""
+    if text.strip() not in ("1", "2"):
+        raise ValueError("expected 1 or 2")
     return int(text)
 
 
@@ -165,7 +182,8 @@ def _per_wheel(text: str) -> Callable[[RobotAnswers], str]:
 DRIVE = RobotQuestion(
     "drive",
     "drive: omni (wheels with rollers, around the middle), mecanum (four, tilted rollers),\n"
-    "  skid (four ordinary wheels), differential (two and casters), general (any wheels)",
+    "  skid (four ordinary wheels), differential (two and casters),\n"
+    "  steered (bicycle, tricycle, car), general (any wheels)",
     "omni",
     _drive,
 )
@@ -184,6 +202,8 @@ _TRACK = RobotQuestion(
 _SHARED = RobotQuestion(
     "shared", "does one motor turn both wheels of a side (yes or no)", "no", yes
 )
+_DRIVEN = RobotQuestion("driven", "axle with the encoders, rear or front", "rear", axle)
+_ENCODERS = RobotQuestion("encoders", "number of encoders on this axle, 1 or 2", "1", one_or_two)
 _PLACES = RobotQuestion(
     "places_m",
     "centres of the wheels, x ahead and y left: x, y; x, y; ... [m]",
@@ -218,6 +238,7 @@ DRIVES: dict[str, tuple[RobotQuestion, ...]] = {
     "mecanum": (_WHEELBASE, _TRACK, _SHARED),
     "skid": (_WHEELBASE, _TRACK, _SHARED),
     "differential": (_TRACK,),
+    "steered": (_WHEELBASE, _DRIVEN, _ENCODERS),
     "general": (_PLACES, _DIRECTIONS, _ROLLERS),
 }
 """Questions for each type of drive, in the order in which they are asked; those in `COMMON`, for
@@ -303,6 +324,8 @@ def robot_of(answers: RobotAnswers) -> Wheels:
         own = {"wheel_azimuths_deg": answers.azimuths_deg, "base_radius_m": answers.base_radius_m}
     elif answers.drive == "differential":
         own = {"track_m": answers.track_m}
+    elif answers.drive == "steered":
+        own = {key: getattr(answers, key) for key in ("wheelbase_m", "driven", "encoders")}
     elif answers.drive == "general":
         own = {
             "wheel_places_m": answers.places_m,

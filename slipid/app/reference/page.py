@@ -18,6 +18,7 @@ _DRIVES: tuple[tuple[type[Any], str, dict[str, object] | None], ...] = (
     (c.FourWheelDrive, "mecanum", {**_BOX}),
     (c.FourWheelDrive, "skid", {**_BOX, "drives": [[1, 3], [2, 4]]}),
     (c.DifferentialDrive, "differential", {"track_m": 0.3}),
+    (c.SteeredDrive, "steered", {"wheelbase_m": 0.3}),
     (c.GeneralDrive, "general", None),
     (c.BenchMotors, "motor", None),
 )

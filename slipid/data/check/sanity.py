@@ -9,7 +9,7 @@ Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`,
 `pose_unexplained`, `lag`, `base_radius`, `time_unit`, `current_sign`, `current_order`,
 `current_unit`, `current_of_supply`, `voltage_sign`, `voltage_order`, `voltage_unit`, `gyro_sign`,
 `gyro_unit`, `command_sign`, `command_order`, `command_unit`, `command_exchanged`, `wheel_columns`,
-`scales`, `travel`, `not_checked`.
+`scales`, `travel`, `steering_sign`, `steering_scale`, `not_checked`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -56,6 +56,7 @@ from slipid.data.check.ratios import (
     ticks_per_radian,
     without_factor,
 )
+from slipid.data.check.steered import steered_findings
 from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
 
@@ -107,6 +108,8 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
         geometry: declared geometry of the robot.
         mass_kg: mass of the robot [kg], or None if it is unknown.
     """
+    if geometry.driven is not None:
+        return worst_first(steered_findings(data, geometry))
     found = tuple(_all(data, geometry, mass_kg))
     if not {finding.kind for finding in found} & {*MADE_REDUNDANT_BY}:
         columns = tuple(misordered(data.logs))
@@ -153,6 +156,12 @@ def _compared(
     if usable(moved.wheels).sum() < FEWEST_STEPS:
         return None
     evidence = gather(geometry, at, moved)
+    if not evidence.pose:
+        note = _not_checked(
+            "the poses have positions alone, headings alone or the ends of runs alone: order, "
+            "signs and sizes of the wheels are not compared with them"
+        )
+        return _Compared((*_of_lag(lag), note), moved, evidence)
     declared = agreement(data, at, moved, evidence, Interpretation())
     if declared.still.all():
         return _Compared(tuple(single_runs(data, declared)), moved, evidence)

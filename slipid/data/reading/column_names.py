@@ -40,6 +40,7 @@ _TABLE: dict[str, str] = {
     "what rpm": "rpm erpm",
     "what gyro": "gyro gyroscope gz",
     "what yaw": "yaw heading theta th psi bearing hdg",
+    "what steering": "steering steer ackermann",
     "what angle": "angle angles ang phi rot rotation rotational",
     "what linear": "linear lin",
     "what angular": "angular",
@@ -322,13 +323,17 @@ def _doubt(parts: NameParts, channel: str) -> str:
     )
 
 
+_OF_ROBOT = ("time", "battery", "gyro", "steering")
+"""Measured quantities that are never those of a wheel, even if a name has its label."""
+
+
 def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
     """Return the channel and the label of a name, or None if it has no known meaning."""
     if parts.has("not") or _of_axis(parts):
         return ("odometry", "") if parts.has("not", "odometry") else None
     label = _label(parts)
     single = _single(parts)
-    if not parts.unknown and single and (not label or parts.has("what", "time", "battery", "gyro")):
+    if not parts.unknown and single and (not label or parts.has("what", *_OF_ROBOT)):
         return single
     what = _measured(parts, unit)
     if what is None or not (label or parts.has("kind")):
@@ -410,6 +415,8 @@ def _single(parts: NameParts) -> tuple[str, str] | None:
     if "battery" in what:
         return None if what & {"current", "duty"} else ("bus_voltage", "")
     angular = what >= {"angular", "speed"} or (what == {"w", "axis"} and axis == ["z"])
+    if "steering" in what:
+        return None if what & {"command", "speed", "current", "torque"} else ("steering_angle", "")
     if "gyro" in what or (angular and "command" not in what):
         return ("gyro", "") if axis in (["z"], []) else None
     if "command" in what or "linear" in what or "angular" in what:

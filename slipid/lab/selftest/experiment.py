@@ -12,7 +12,13 @@ from scipy.stats import binom, chi2
 from slipid.app.check import expected
 from slipid.app.config import Config, read_config, single_floor_sections
 from slipid.app.logs import layout_of
-from slipid.app.problem import ConfigFitTask, fit_task, read_fit_task, shape_of
+from slipid.app.problem import (
+    ConfigFitTask,
+    fit_task,
+    read_fit_task,
+    refuse_steered,
+    shape_of,
+)
 from slipid.data.runs import collect
 from slipid.fitting.problem import Problem
 from slipid.infer.verdicts.estimates import derived
@@ -88,6 +94,7 @@ def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
     every load set-up of the config on every floor.
     """
     wanted, shape = config.content.selftest, shape_of(config)
+    refuse_steered(shape)
     sections = single_floor_sections(config.content.logs)
     loads = list(dict.fromkeys(section.load for section in sections))
     setups = [(floor, load) for floor in wanted.surfaces for load in loads]

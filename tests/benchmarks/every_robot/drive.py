@@ -268,11 +268,11 @@ def write(robot: MadeRobot, folder: Path, seed: int) -> dict[str, Judged]:
             label = robot.floors[0].name if mislaid else floor.name
             name = f"{'x' if mislaid else ''}{number:02d}.csv"
             run = driven(robot, floor, commands(robot, rng, number, False), rng)
-            _write_csv(folder / "logs" / label / name, table(robot, run, rng))
+            write_csv(folder / "logs" / label / name, table(robot, run, rng))
         for number in range(4):
             run = driven(robot, floor, commands(robot, rng, number, True), rng)
             columns = table(robot, run, rng)
-            _write_csv(folder / "fresh" / floor.name / f"{number:02d}.csv", columns)
+            write_csv(folder / "fresh" / floor.name / f"{number:02d}.csv", columns)
             posed = columns["t"][~np.isnan(columns.get("x", columns.get("heading")))]
             ends = run.sensor(robot, posed[[0, -1]] - robot.lag)
             path = float(np.hypot(*np.diff(run.pose[:, :2], axis=0).T).sum())
@@ -280,7 +280,7 @@ def write(robot: MadeRobot, folder: Path, seed: int) -> dict[str, Judged]:
     return truth
 
 
-def _write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
+def write_csv(path: Path, columns: dict[str, np.ndarray]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     cells = [["" if np.isnan(v) else f"{v:.9g}" for v in column] for column in columns.values()]
     lines = [",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]
@@ -303,7 +303,11 @@ def config(robot: MadeRobot) -> str:
             f"half_length_m = {robot.half_length}",
             f"half_width_m = {round(base - robot.half_length, 6)}",
         ],
-        "steered": [f"wheelbase_m = {base}", f'driven = "{robot.driven}"'],
+        "steered": [
+            f"wheelbase_m = {base}",
+            f'driven = "{robot.driven}"',
+            f"encoders = {robot.drives}",
+        ],
     }[robot.drive]
     gear = robot.motors.gear if robot.motors else 1.0
     lines += [f"gear_ratio = {gear}", f"mass_kg = {robot.mass}", "", "[layouts.mine]"]

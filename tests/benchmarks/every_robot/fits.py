@@ -74,8 +74,6 @@ def kinematics(content: dict) -> Kinematics:
 
 def answer(robot: MadeRobot, folder: Path, truth: dict[str, Judged]) -> Answer:
     """Fit the logs of a folder and predict its fresh runs, as a user would on the command line."""
-    if not robot.readable:
-        return Answer("config not readable yet")
     config, out = folder / "robot.toml", folder / "out"
     done = invoke("identify", config, "--data", folder / "logs", "--out", out, "--quiet")
     if done.exit_code not in (0, 1) or not (out / "identified.json").exists():
@@ -121,7 +119,7 @@ def covered(robot: MadeRobot, calibration: dict) -> dict[str, bool]:
             stated[f"base {floor}"] = of[key]
     if "steering" in calibration:
         for floor in robot.floors:
-            stated[f"base {floor.name}"] = calibration["steering"]["wheelbase_m"]
+            stated.setdefault(f"base {floor.name}", calibration["steering"]["wheelbase_m"])
     truth, found = true(robot), {}
     for name, number in numbers(robot).items():
         if stated.get(name, {}).get("interval90") is not None:

@@ -125,7 +125,7 @@ class MadeRobot:
 
     @property
     def readable(self) -> bool:
-        """Whether slipid can read the config at all; it does not know steered robots yet."""
+        """Whether `slipid identify` fits the robot at all; it refuses steered robots yet."""
         return self.drive != "steered"
 
     @property

@@ -1,0 +1,138 @@
+"""Robots that steer: from config and logs to checks, with what slipid cannot do for them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slipid.app.config import parsed, read_config
+from slipid.app.problem import read_fit_task
+from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
+from tests.benchmarks.every_robot.drive import write
+from tests.benchmarks.every_robot.robots import ROBOTS
+from tests.helpers.shared import invoke
+
+MADE = {robot.name: robot for robot in ROBOTS}
+CAR = replace(MADE["ackermann_car"], runs=2)
+
+
+@pytest.fixture(scope="module")
+def car(tmp_path_factory) -> Path:
+    """Return a folder with the config and logs of a car."""
+    folder = tmp_path_factory.mktemp("car")
+    write(CAR, folder, seed=1)
+    return folder
+
+
+def changed(car: Path, tmp_path: Path, *pairs: tuple[str, str]) -> Path:
+    """Return the path of a changed config of the car."""
+    text = (car / "robot.toml").read_text(encoding="utf-8")
+    for old, new in pairs:
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "robot.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def read(config: Path, data: Path):
+    with Reporter(quiet=True) as report:
+        return read_fit_task(read_config(config), data, report)
+
+
+STEERING = 'steering_angle = { column = "steering", unit = "rad" }'
+
+
+def test_the_steering_angle_is_read_in_radians(car, tmp_path):
+    task = read(car / "robot.toml", car / "logs")
+    runs = task.dataset
+    assert "steering" in repr(runs)
+    rows = np.genfromtxt(car / "logs" / "asphalt" / "00.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(runs.logs[0].steering, rows["steering"], atol=1e-12)
+    degrees = changed(car, tmp_path, (STEERING, STEERING.replace("rad", "deg")))
+    turned = read(degrees, car / "logs").dataset.logs[0].steering
+    np.testing.assert_allclose(turned, np.radians(rows["steering"]), atol=1e-12)
+    assert task.robot.geometry.drives == 2
+
+
+def test_a_slow_steering_angle_is_linear_between_its_readings(car, tmp_path):
+    lines = (car / "logs" / "asphalt" / "00.csv").read_text(encoding="utf-8").splitlines()
+    column = lines[0].split(",").index("steering")
+    kept = [lines[0]]
+    for k, line in enumerate(lines[1:]):
+        cells = line.split(",")
+        cells[column] = cells[column] if k % 5 == 0 else ""
+        kept.append(",".join(cells))
+    path = tmp_path / "logs" / "asphalt" / "00.csv"
+    path.parent.mkdir(parents=True)
+    path.write_text("\n".join(kept) + "\n", encoding="utf-8")
+    every, slow = (
+        read(car / "robot.toml", folder / "logs").dataset.logs[0] for folder in (car, tmp_path)
+    )
+    at = np.append(np.arange(0, slow.samples, 5), slow.samples)[:-1]
+    between = np.interp(slow.time, slow.time[at], every.steering[at])
+    np.testing.assert_allclose(slow.steering, between, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (STEERING, "", "no steering angle; expected the channel steering_angle"),
+        ("encoders = 2", "encoders = 1", "1 wheels, but .* robot.encoders is the number on the"),
+        ("encoders = 2", "encoders = 3", "encoders"),
+        ("encoders = 2", "drives = [[1, 2]]", "drives is given; expected encoders"),
+        (STEERING, STEERING.replace("}", ", scale = 57.3 }"), "steering of .* rad"),
+    ],
+)
+def test_mistakes_are_refused_with_what_is_expected(car, tmp_path, old, new, says):
+    with pytest.raises(DataError, match=says):
+        read(changed(car, tmp_path, (old, new)), car / "logs")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "kinds", "says"),
+    [
+        ("", "", set(), ""),
+        (STEERING, STEERING.replace("}", ", scale = -1 }"), {"steering_sign"}, "right"),
+        (STEERING, STEERING.replace("}", ", scale = 2.5 }"), {"steering_scale"}, "wheelbase_m"),
+        ("0.0325", "0.065", {"wheel_scale"}, "0.4"),
+        ('unit = "rad" }\nsteering', 'unit = "rad", scale = -1 }\nsteering', {"wheel_sign"}, "180"),
+    ],
+)
+def test_check_compares_wheels_and_steering_with_the_poses(car, tmp_path, old, new, kinds, says):
+    config = changed(car, tmp_path, (old, new)) if old else car / "robot.toml"
+    out = tmp_path / "out"
+    done = invoke("check", config, "--data", car / "logs", "--out", out, "--quiet")
+    text = (out / "check.json").read_text(encoding="utf-8")
+    assert "no force balance for steered wheels" in text
+    found = json.loads(text)["findings"]
+    assert {one["kind"] for one in found if one["severity"] != "note"} == kinds, found
+    assert says in " ".join(f"{one['found']} {one['remedy']}" for one in found)
+    assert done.exit_code == (1 if kinds else 0)
+
+
+def test_what_needs_a_force_balance_says_that_there_is_none(car, tmp_path):
+    for data in ((), ("--data", car / "logs")):
+        done = invoke("selftest", car / "robot.toml", *data, "--out", tmp_path / "out")
+        assert done.exit_code == 2
+        assert "no force balance for steered wheels" in done.stderr
+
+
+def test_new_asks_for_the_axles_and_recognises_a_steering_angle(car, tmp_path):
+    out = tmp_path / "new.toml"
+    done = invoke("new", "--drive", "steered", "--driven", "front", "--yes", "--out", out)
+    assert done.exit_code == 0
+    assert "front axle, steered, positive to the left, 1 encoder" in done.stdout
+    assert "selftest" not in done.stdout
+    robot = parsed(out, out.read_text(encoding="utf-8")).content.robot
+    assert (robot.drive, robot.driven, robot.encoders) == ("steered", "front", 1)
+    done = invoke("new", "--from", car / "logs", "--out", out, "--force")
+    content = read_config(out).content
+    assert content.robot.drive == "steered"
+    assert '"steering"' in str(content.layouts).replace("'", '"')
+    done = invoke("new", "--drive", "steered", "--driven", "left", "--yes", "--out", out, "--force")
+    assert done.exit_code == 2
+    assert "expected rear or front" in done.stderr
