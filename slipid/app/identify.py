@@ -350,11 +350,11 @@ def _mixed_sentence(about: Mapping[str, Any]) -> str:
 
 def _with_baselines(fit: Fit, task: FitTask) -> Fit:
     """Return the fit with simpler models, fitted to the same runs with the calibrated sensor."""
-    seen, shape = fit.seen, fit.space.template.geometry
+    seen, shape = fit.seen, fit.config_shape
     cut = task.windows(seen)
     learnt = [model.fit(cut, seen) for model in slip_models(shape, fit.channels.current)]
     if fit.calibration is not None:
-        own = calibrated_model(fit.calibration, fit.space.template)
+        own = calibrated_model(fit.calibration, shape)
         learnt = [own if model.name == own.name else model for model in learnt]
     plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}
     return replace(fit, baselines=plain)

@@ -26,13 +26,14 @@ Mandow et al. 2007, IROS; rolling omni wheels, Indiveri 2009, IEEE T-RO 25(1);
 steady turn with understeer, Gillespie 1992, Fundamentals of Vehicle Dynamics, chapter 6.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.model.geometry import Geometry
+from slipid.parameter import as_numbers
 
 
 class Steering(NamedTuple):
@@ -137,6 +138,17 @@ def nominal_base(shape: Geometry) -> float:
         return float(shape.base_radius)
     arm = np.abs(np.asarray(shape.forward())[:, 2])
     return float(arm.mean()) * (1.0 if shape.determines_twist else 2.0)
+
+
+def with_lengths(shape: Geometry, radius: float, base: float) -> Geometry:
+    """Return a geometry with equal wheels of another radius, and another track or base [m]."""
+    ratio = base / nominal_base(shape)
+    return replace(
+        shape,
+        wheel_radius=as_numbers(radius),
+        base_radius=as_numbers(float(shape.base_radius) * ratio),
+        radius_deviation=as_numbers(np.zeros(shape.drives)),
+    )
 
 
 def is_axle(shape: Geometry) -> bool:

@@ -334,7 +334,7 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c["draws"].update(mass=[1]), "'mass' is not a parameter"),
         (
             lambda c: c["units"].update(alike="m"),
-            "the units in this file differ from the units of slipid.robot/6",
+            "the units in this file differ from the units of slipid.robot/7",
         ),
         (lambda c: c["gains"]["values"].pop("yaw"), "gains.values.yaw is missing"),
         (
