@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slipid.app.calibrate import calibrated
 from slipid.app.config import FitSection
-from slipid.app.identify import calibrated, optimised, summarised
+from slipid.app.identify import optimised, summarised
 from slipid.app.problem import FitTask, of_torques, robot_for_runs, stated_sizes
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs

@@ -229,9 +229,9 @@ def test_what_is_no_robot_is_refused(tmp_path):
 
 
 def test_a_newer_file_asks_for_an_update(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/7", more=3))
+    rewritten(path, lambda c: c.update(schema="slipid.robot/8", more=3))
     said = refused(path)
-    assert "written by a newer slipid as slipid.robot/7" in said
+    assert "written by a newer slipid as slipid.robot/8" in said
     assert "update slipid" in said
 
 
