@@ -1,7 +1,4 @@
-"""Fit of a robot to the logs of a config or to runs, with verdicts and result files.
-
-One of the verdicts compares the fit's open-loop predictions of its own runs with encoder odometry.
-"""
+"""Fit of a robot to the logs of a config or to runs, with verdicts and result files."""
 
 import math
 import time
@@ -18,7 +15,7 @@ from slipid.app.config import read_config
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.data.check.findings import wrong
-from slipid.data.runs import Runs
+from slipid.fitting.calibration import Calibration
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise
@@ -26,13 +23,18 @@ from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
-from slipid.infer.verdicts.disputed import EndPoints, Trust, verdict_of_trust
 from slipid.infer.verdicts.profile import Profile, profile, profiled
-from slipid.predict import open_loop as replay
+from slipid.infer.verdicts.trust import Trust
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
-from slipid.predict.kinematics import Encoder
-from slipid.predict.slip_models import FloorModels, slip_models
-from slipid.predict.validation import ScoredRun, add_scores
+from slipid.predict.selection import (
+    Errors,
+    calibrated_model,
+    contact_errors,
+    kinematic_errors,
+    selected,
+)
+from slipid.predict.slip_models import slip_models
+from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_json
@@ -53,14 +55,12 @@ class IdentifyResult:
     Attributes:
         fit: the fit.
         task: runs, config and choices from which the fit was made.
-        trust: verdict on the fit by its open-loop predictions.
         profiles: profile likelihoods that were requested.
         written: names of the written files.
     """
 
     fit: Fit
     task: ConfigFitTask
-    trust: Trust
     profiles: tuple[Profile, ...]
     written: tuple[str, ...]
 
@@ -96,7 +96,8 @@ def identify(
     report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")
     _check_sanity(task, report, anyway)
     task = with_mixed(task, data, report)
-    report.stage("cutting windows")
+    kinematic = calibrated(task, report)
+    task = task.started_from(kinematic.calibration)
     problem = task.problem()
     for path in profiles:
         try:
@@ -109,12 +110,10 @@ def identify(
     key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
     kept = Checkpoint(out, key)
     problem, optimum = optimised(task, problem, kept, report)
-    fit = summarised(task, problem, optimum, report)
-    report.stage("predicting the fitted runs")
-    trust = trust_report(fit, task.dataset)
+    fit = summarised(task, problem, optimum, report, kinematic)
     report.stage("writing")
     written = (*save(fit, out), "run.json", "config.toml")
-    _write_run(task, trust, data, out, time.monotonic() - began)
+    _write_run(task, fit.trust, data, out, time.monotonic() - began)
     if profiles and task.mixed:
         report.line("profiles use only the runs on one floor each")
 
@@ -130,7 +129,7 @@ def identify(
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written = (*written, "profile.json")
     kept.remove(f"{CHECKPOINT}.npz")
-    return IdentifyResult(fit, task, trust, tuple(result), written)
+    return IdentifyResult(fit, task, tuple(result), written)
 
 
 def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
@@ -250,15 +249,45 @@ def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | Non
     return start, history
 
 
-def summarised(task: FitTask, problem: Problem, optimum: Optimum, report: Reporter) -> Fit:
+@dataclass(frozen=True, eq=False)
+class KinematicFit:
+    """Calibrated kinematics of a task.
+
+    Attributes:
+        calibration: calibration from all runs.
+        errors: errors of the kinematic models on held-out runs.
+    """
+
+    calibration: Calibration
+    errors: Errors
+
+
+def calibrated(task: FitTask, report: Reporter) -> KinematicFit:
+    """Return the calibrated kinematics of a task, and report their numbers."""
+    report.stage("calibrated kinematics")
+    space = Space(task.robot, task.choices)
+    found = KinematicFit(*kinematic_errors(task.dataset, space, task.choices))
+    for sentence in found.calibration.sentences:
+        report.line(sentence)
+    return found
+
+
+def summarised(
+    task: FitTask, problem: Problem, optimum: Optimum, report: Reporter, kinematic: KinematicFit
+) -> Fit:
     """Return the fit from an optimum, with intervals, verdicts and simpler models for comparison.
 
-    Runs over several floors, if the task has some, are fitted as well.
+    The slip model of every floor is selected. Runs over several floors, if the task has some, are
+    fitted as well.
     """
     report.stage("intervals and verdicts")
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
         fit = _with_mixed_runs(fit, task, problem, optimum, report)
+    report.stage("predicting held-out runs")
+    contact = contact_errors(task.dataset, problem, optimum)
+    selection = selected(task.dataset, {**kinematic.errors, "contact": contact})
+    fit = replace(fit, calibration=kinematic.calibration, selection=selection)
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
 
@@ -320,47 +349,12 @@ def _mixed_sentence(about: Mapping[str, Any]) -> str:
 
 
 def _with_baselines(fit: Fit, task: FitTask) -> Fit:
-    """Return the fit with simpler models, fitted to the same runs with the fit's camera and lag."""
-    cut, shape = task.windows(fit.robot), fit.space.template.geometry
-    learnt = [model.fit(cut, fit.robot) for model in slip_models(shape, fit.channels.current)]
+    """Return the fit with simpler models, fitted to the same runs with the calibrated sensor."""
+    seen, shape = fit.seen, fit.space.template.geometry
+    cut = task.windows(seen)
+    learnt = [model.fit(cut, seen) for model in slip_models(shape, fit.channels.current)]
+    if fit.calibration is not None:
+        own = calibrated_model(fit.calibration, fit.space.template)
+        learnt = [own if model.name == own.name else model for model in learnt]
     plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}
     return replace(fit, baselines=plain)
-
-
-ENCODER = FloorModels(Encoder())
-MOST_RUNS = 24
-"""Largest number of predicted runs on each floor, which are picked evenly from the fitted runs."""
-
-
-def trust_report(fit: Fit, data: Runs) -> Trust:
-    """Return the verdict on a fit from open-loop predictions of the runs that it was fitted to."""
-    some = data.subset(_picked(data))
-    runs: dict[int, ScoredRun] = {}
-    try:
-        cuts = replay.replay_windows(some, fit.robot)
-    except DataError:  # the fitted lag may be so large that a short run has no windows
-        cuts = []
-    for w in cuts:
-        plain = replay.tracks_from_increments(fit.robot, w, ENCODER.increments(w, fit.robot))
-        for name, tracks in ((fit.contact.name, fit.contact.tracks(w)), (ENCODER.name, plain)):
-            add_scores(runs, some, name, tracks, None)
-    errors: dict[str, list[list[float]]] = {}
-    for run in runs.values():
-        off = [score.endpoint_error_over_path for score in run.models.values()]
-        errors.setdefault(run.surface, []).append(off)
-    floors = {
-        name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
-    }
-    return verdict_of_trust(floors, fit.converged, fit.parameters.values(), len(runs))
-
-
-def _picked(data: Runs) -> list[int]:
-    """Return the indices of at most `MOST_RUNS` runs on every floor."""
-    of_floor: dict[str, list[int]] = {}
-    for k, log in enumerate(data.logs):
-        of_floor.setdefault(log.surface or "unknown", []).append(k)
-    out = []
-    for runs in of_floor.values():
-        at = np.unique(np.linspace(0, len(runs) - 1, MOST_RUNS).round().astype(int))
-        out += [runs[k] for k in at]
-    return sorted(out)

@@ -48,10 +48,10 @@ def identify(
 
     def show(page: "Page") -> None:
         show_fit(page, done.fit, done.profiles)
-        show_trust(page, done.trust)
+        show_trust(page, done.fit.trust)
 
     emit(json, content, show, out, done.written)
-    return 0 if done.fit.converged and not done.trust.is_bad else 1
+    return 0 if done.fit.converged and not done.fit.trust.is_bad else 1
 
 
 def run(
@@ -79,7 +79,7 @@ def run(
     report.stage("drawing")
     drawn = [out / name for name in write_robot(out, done.fit)]
     try:
-        warning = done.trust.warning
+        warning = done.fit.trust.warning
         drawn += identify_plots(done.fit, done.task.dataset, out, warning)
     except DataError as error:  # a run is too short to be drawn; the results are already written
         report.line(f"no further pictures: {error}")

@@ -64,7 +64,8 @@ class Log:
         gyro: yaw rate [rad/s], or None.
         steering: steering angle, positive to the left [rad], linear between readings, or None.
         pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the camera's log (not
-            corrected for a wrong camera scale), or None.
+            corrected for a wrong camera scale), or None; nan in coordinates that were not measured,
+            such as the heading of a satellite receiver or the position of a compass.
         pose_fresh: False where the row repeats the last pose.
         pose_clock: clock offset and drift, estimated from the motion, of poses that have times of
             their own; else None.

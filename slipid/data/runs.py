@@ -31,7 +31,8 @@ class Runs:
         time: time within the run [s] (sample,).
         wheel_angle: angle of each wheel [rad] (sample, wheel), linear across telemetry stalls.
         steering: steering angle [rad] (sample,), or None if a run has none.
-        pose: x [m], y [m], heading [rad], in the scale of the log.
+        pose: x [m], y [m], heading [rad], in the scale of the log; nan in coordinates that were not
+            measured.
         fresh: False where the row repeats the last camera frame.
         live: False in the rows of a telemetry stall, whose currents are stale.
         current: motor currents [A] (sample, wheel), or None if a run has none.
@@ -156,7 +157,9 @@ def collect(
                 "torques in all runs, or torque_constant [N m/A] in the layout of the torques"
             )
         if log.pose is None:
-            raise DataError(f"{log.name}: no pose; expected pose columns, which a fit needs")
+            raise DataError(
+                f"{log.name}: no pose; expected columns of x and y, of a heading, or of all three"
+            )
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
     heading, speed, turn = np.array([_command(log) for log in logs]).T
     bridged = [bridge_stalls(log.time, log.wheel_angle) for log in logs]

@@ -104,7 +104,8 @@ def windows(
         longest: largest duration of a window [s]; longer runs have more segments.
 
     Raises:
-        DataError: no wheel of a run moves by `MOVED_M`, or a run has too few poses for its windows.
+        DataError: no wheel of a run moves by `MOVED_M`, or a run has too few poses for its windows,
+            or poses that lack a coordinate.
     """
     each = [_edges(data, k, wheel_radius, lag, per_segment, longest) for k in range(len(data))]
     run = [k for k, segments in enumerate(each) for _ in segments]
@@ -125,6 +126,36 @@ def windows(
         current_is_signed=data.current_is_signed,
         lag=lag,
     )
+
+
+DURATIONS_S, STEADY = (6.0, 3.0, 1.5, 0.75), 0.04
+"""Durations of windows [s], and largest deviation of wheel angles from constant speeds in a window,
+as a fraction of their turn [1]."""
+MOST_STEADY_RUNS = 24
+"""Largest number of runs from which the duration of windows is chosen."""
+
+
+def steady_duration(data: Runs) -> float:
+    """Return the longest duration over which wheels keep nearly constant speeds [s].
+
+    A window has one body twist: a longer one would average over turns and straight parts.
+    """
+    some = np.unique(np.linspace(0, len(data) - 1, MOST_STEADY_RUNS).round().astype(int))
+    for duration in DURATIONS_S[:-1]:
+        bent, whole = 0.0, 0.0
+        for k in some.tolist():
+            rows = data.rows(k)
+            t, angle = data.time[rows], data.wheel_angle[rows]
+            edges = np.arange(t[0], t[-1], duration)
+            if len(edges) > 1:
+                line = interpolate(edges, interpolate(t, angle, edges), t)
+                bent += float(np.abs(angle - line).mean(axis=0).max()) * (len(edges) - 1)
+                whole += float(
+                    np.abs(np.diff(interpolate(t, angle, edges), axis=0)).sum(axis=0).max()
+                )
+        if bent < STEADY * whole:
+            return duration
+    return DURATIONS_S[-1]
 
 
 def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
@@ -179,6 +210,7 @@ def _edges(
     """
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
+    _require_whole_poses(data, run)
     shown = time[fresh] - lag
     fresh = fresh[(fresh >= first) & (shown >= time[0] - 1e-9) & (shown <= time[-1] + 1e-9)]
     if len(fresh) < per_segment + 1:
@@ -197,6 +229,20 @@ def _edges(
         picked = np.linspace(0, len(fresh) - 1, count + 1).round().astype(int)
     rows = fresh[picked]
     return [rows[k : k + per_segment + 1] for k in range(0, count, per_segment)]
+
+
+def _require_whole_poses(data: Runs, run: int) -> None:
+    """Raise `DataError` if poses of a run lack a coordinate, or if there are at most two."""
+    pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
+    lacking = np.isnan(pose).any(axis=0)
+    what = "without headings" if lacking[2] else "without positions" if lacking.any() else ""
+    if not what and len(pose) > 2:
+        return
+    raise DataError(
+        f"{data.logs[run].name}: poses {what or f'in {len(pose)} rows only'}; expected x, y and "
+        "heading during the run, which a fit of motors and contact needs. Kinematics alone can be "
+        "calibrated: slipid identify --only calibration"
+    )
 
 
 def _cut(

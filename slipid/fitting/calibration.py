@@ -368,7 +368,8 @@ class _Model:
         floors, sessions: names of floors and sessions.
         firmest: index of the floor to which radii refer.
         numbers: coordinates of the search vector, keyed by name.
-        unseen: names of coordinates that no run shows, and that stay at their prior means.
+        unseen: names of coordinates that no run shows, such as the track without turns, or the
+            radius without positions; they stay at their prior means.
     """
 
     space: Space
@@ -418,6 +419,14 @@ class _Model:
         unseen = {f"{what}.{f}" for f in straight for what in ("base", "centre")}
         if straight == set(floors):
             unseen |= {"offset.x", "offset.y"}
+        seen = np.isfinite(data.pose[data.fresh]).any(axis=0)
+        if not seen[0]:
+            # Headings alone show ratios of lengths, so the config's radius counts as known.
+            unseen |= {"radius", "offset.x", "offset.y", "scale", *(f"floor.{f}" for f in others)}
+        if not seen[2]:
+            unseen |= {"yaw", *(f"yaw@{s}" for s in sessions)}
+        if max(int(data.fresh[data.rows(k)].sum()) for k in range(len(data))) < 3:
+            unseen.add("lag")
         unseen &= set(numbers)
         return cls(space, floors, sessions, firmest, numbers, frozenset(unseen))
 
@@ -709,6 +718,30 @@ def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calib
     Raises:
         DataError: no run has two poses.
     """
+    return _result(_fitted(data, space, choices))
+
+
+def cross_calibrated(
+    data: Runs, space: Space, choices: Sequence[Choice], fold: Int[np.ndarray, " run"]
+) -> tuple[Calibration, dict[int, Calibration]]:
+    """Return the calibration from all runs, and for each fold that from all runs outside it.
+
+    The latter follow from the former by one Gauss-Newton step, which is exact for numbers in which
+    the poses are linear. Arguments are those of `calibrate`; runs with fold -1 are never left out.
+    """
+    fit = _fitted(data, space, choices)
+    (r, slope), (_, a) = fit.linear, fit.gradient
+    of_track, without = fold[fit.tracks.run], {}
+    for k in sorted(set(of_track.tolist()) - {-1}):
+        mine = np.flatnonzero(of_track == k)
+        inner = np.einsum("nmi,nmj->ij", slope[mine], slope[mine])
+        pull = np.einsum("nmi,nm->i", slope[mine], r[mine])
+        without[k] = _result(replace(fit, z=fit.z + np.linalg.solve(a - inner, pull)), rough=True)
+    return _result(fit), without
+
+
+def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
+    """Return the end of a calibration; arguments are those of `calibrate`."""
     model = _Model.of(space, choices, data, 0)
     z = np.array([model.numbers[name].mean for name in model.free])
     lag = pose_lag(data)
@@ -729,7 +762,7 @@ def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calib
         ):
             break
 
-    return _result(fit, len(data))
+    return fit
 
 
 def _in_stds(
@@ -801,25 +834,28 @@ def _changes(fit: _Fit) -> Float[np.ndarray, "part free"]:
     return np.array(out)
 
 
-def _result(fit: _Fit, runs: int) -> Calibration:
-    """Return the calibration with intervals and verdicts."""
+def _result(fit: _Fit, rough: bool = False) -> Calibration:
+    """Return the calibration with intervals and verdicts; `rough` ones have too narrow intervals.
+
+    Rough intervals save the time of the jackknife where only the values are used.
+    """
     model, z = fit.model, fit.z
-    covariance, changes = np.linalg.inv(fit.gradient[1]), _changes(fit)
+    changes = np.zeros((2, len(z))) if rough else _changes(fit)
+    covariance = np.zeros((len(z), len(z))) if rough else np.linalg.inv(fit.gradient[1])
     count = len(changes)
     off = changes - changes.mean(axis=0)
 
     def value(names: Sequence[str], unit: str, log_of: float | None = None) -> Value:
         """Return the sum of some coordinates, or the exponential of the sum, times `log_of`."""
         w = np.array([float(name in names) for name in model.free])
-        prior = float(
-            np.hypot.reduce(
-                [model.numbers[name].std for name in names if name in model.numbers], initial=0.0
-            )
-        )
+        stds = {name: model.numbers[name].std for name in names if name in model.numbers}
+        prior = float(np.hypot.reduce([*stds.values()], initial=0.0))
+        hidden = [std for name, std in stds.items() if name in model.unseen]
         at = sum(float(model.column(name, z)) for name in names)
         influence = (off @ w) ** 2
         jackknife = (count - 1) / count * float(influence.sum())
-        std = float(np.sqrt(max(float(w @ covariance @ w), jackknife))) if w.any() else prior
+        std = float(np.sqrt(max(float(w @ covariance @ w), jackknife)))
+        std = float(np.hypot.reduce([std, *hidden])) if w.any() else prior
         share = influence / max(float(influence.sum()), 1e-300)
         freedom = max(1 / max(float((share**2).sum()), 1e-9) - 1, 3.0)
         half = std * float(student.ppf(0.95, freedom))
@@ -859,7 +895,7 @@ def _result(fit: _Fit, runs: int) -> Calibration:
         nominal_radius=radius,
         nominal_base=base,
         noise=_noise(fit),
-        runs=runs,
+        runs=len(fit.data),
     )
 
 

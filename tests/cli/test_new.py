@@ -88,8 +88,15 @@ def test_columns_that_are_not_used_stand_on_the_screen(tmp_path):
     path = table(tmp_path / "run.csv", columns)
     said = invoke("new", "--from", path, "--out", tmp_path / "mine.toml", *DIFFERENTIAL).stdout
     assert "Not used: gripper, mode." in said
-    assert "Not used: pose_x: a pose needs x, y, and a heading or a quaternion" in said
-    assert "? of a pose only x (column x) and y (column y) was found: a fit needs" in said
+    found = "? of a pose only x (column x) and y (column y) was found: motors and contact need x, y"
+    assert found in said
+    assert "identify --only calibration does without one of them" in said
+
+
+def test_a_coordinate_alone_is_no_position(tmp_path):
+    path = table(tmp_path / "run.csv", {n: v for n, v in plain().items() if n != "y"})
+    said = invoke("new", "--from", path, "--out", tmp_path / "mine.toml", *DIFFERENTIAL).stdout
+    assert "Not used: pose_x: a position needs both x and y" in said
 
 
 def test_topics_that_are_not_used_stand_on_the_screen_and_the_drive_has_two_wheels(tmp_path):

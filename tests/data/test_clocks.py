@@ -250,6 +250,16 @@ def test_tracked_poses_beside_a_log_are_read_on_its_clock(tmp_path):
     assert fresh.sum() < 0.97 * 11 * 29
 
 
+def test_positions_without_headings_have_a_clock_of_their_own_too(tmp_path):
+    write(tmp_path, Drive(6, seconds=24.0))
+    tracked = {"format": "tracked", "columns": {"pose_heading": False}}
+    log = read(tmp_path, layout(beside={"{stem}.poses.csv": tracked}))
+    assert np.isnan(log.pose[:, 2]).all()
+    assert log.pose_clock.source == "wheels"
+    assert log.pose_clock.offset == pytest.approx(OFFSET, abs=0.03)
+    assert abs(log.pose_clock.offset - OFFSET) < 3 * log.pose_clock.offset_std
+
+
 def test_poses_of_another_run_are_refused_with_what_to_do(tmp_path):
     write(tmp_path, Drive(6))
     still = Drive(7)

@@ -71,6 +71,19 @@ def test_slow_poses_of_a_robot_with_three_wheels_give_it_too():
     assert found.seconds == pytest.approx(0.3, abs=0.03)
 
 
+@pytest.mark.parametrize("lacking", [[2], [0, 1]], ids=["positions", "headings"])
+def test_positions_or_headings_alone_give_it_too(lacking):
+    """Positions show only speed, which must therefore change; poses of the ends do not disturb."""
+    logs = [run(0.4, seed) for seed in range(6)]
+    for log in logs[:5]:
+        log.pose[:, lacking] = np.nan
+    logs[5].pose_fresh[1:-1] = False
+    found = pose_lag(collect(logs))
+    assert found is not None
+    assert found.decisive
+    assert found.seconds == pytest.approx(0.4, abs=0.02)
+
+
 def test_steady_motion_gives_no_lag():
     assert pose_lag(collect([run(0.4, seed, steady=True) for seed in range(3)])) is None
 

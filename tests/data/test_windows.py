@@ -349,7 +349,7 @@ def test_different_robots_are_refused():
 
 
 def test_runs_without_poses_are_refused():
-    with pytest.raises(DataError, match=r"b\.csv: no pose; expected pose columns"):
+    with pytest.raises(DataError, match=r"b\.csv: no pose; expected columns of x and y, of a"):
         collect([run("a.csv"), run("b.csv", pose=None, pose_fresh=None)])
 
 
@@ -366,6 +366,24 @@ def test_a_run_with_too_few_frames_is_refused():
     data = collect([run(pose_fresh=None), run("blind.csv", pose_fresh=fresh)])
     with pytest.raises(DataError, match=r"blind\.csv: 4 poses .*; expected at least 5"):
         windows(data, RADIUS)
+
+
+@pytest.mark.parametrize(
+    ("lacking", "what"), [([2], "without headings"), ([0, 1], "without positions")]
+)
+def test_runs_without_whole_poses_are_refused_with_what_they_are_good_for(lacking, what):
+    part = run("part.csv")
+    part.pose[:, lacking] = np.nan
+    with pytest.raises(DataError, match=rf"part\.csv: poses {what}.*identify --only calibration"):
+        windows(collect([run(), part]), RADIUS)
+
+
+def test_poses_of_the_ends_alone_are_no_windows():
+    ends = run("ends.csv")
+    fresh = np.zeros(ends.samples, bool)
+    fresh[[0, -1]] = True
+    with pytest.raises(DataError, match=r"ends\.csv: poses in 2 rows only; expected x, y and"):
+        windows(collect([run("ends.csv", pose_fresh=fresh)]), RADIUS)
 
 
 # the direction of motion, which friction follows

@@ -102,6 +102,18 @@ def test_positions_without_headings(task_of):
     assert near(found.offset[0], 0.060, 3e-3)
 
 
+def test_headings_alone_show_ratios_of_lengths(task_of):
+    """The config's radius is taken as given; the track over it and the radii's ratio are right."""
+    found = calibrated(task_of(MADE["diff_heading"]))
+    left, right = found.radius["floor"]
+    assert left.verdict == right.verdict == "not_identified"
+    assert np.ptp(left.interval90) > 0.5 * left.value
+    assert left.value / right.value == pytest.approx(0.0505 / 0.0495, rel=2e-3)
+    assert near(found.base["floor"], 0.315, 2e-3)
+    assert [place.verdict for place in found.offset] == ["not_identified"] * 2
+    assert found.lag.verdict == "identified"
+
+
 def test_a_number_that_the_config_fixes_stays(task_of):
     found = calibrated(task_of(MADE["diff_own"]), Choice("camera.lag", fixed=0.02))
     assert found.lag.value == 0.02

@@ -188,9 +188,9 @@ def _unusable(found: FileChannel, run: RunStudy) -> dict[str, str] | None:
         return {"comment": _BATTERY_VOLTAGE}
     if channel == "bus_voltage" and run.find("duty") is None:
         return {"comment": "used only together with a duty cycle"}
-    if channel.startswith("pose_") and not run.has_pose:
-        return {"comment": "a pose needs x, y, and a heading or a quaternion"}
-    if channel.startswith("pose_") and run.place_unit.unit in PIXELS:
+    if channel in ("pose_x", "pose_y") and not (run.find("pose_x") and run.find("pose_y")):
+        return {"comment": "a position needs both x and y"}
+    if channel in ("pose_x", "pose_y") and run.place_unit.unit in PIXELS:
         return {"question": "give metres_per_pixel in the layout" if channel == "pose_x" else ""}
     return None
 

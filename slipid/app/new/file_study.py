@@ -61,10 +61,19 @@ class FileStudy:
         return len(turns.columns) if turns else 0
 
     @property
-    def has_pose(self) -> bool:
-        """Return whether the file has a complete pose: x, y, and a heading or a quaternion."""
-        turned = self.find("pose_heading", "pose_quaternion")
-        return bool(self.find("pose_x") and self.find("pose_y") and turned)
+    def has_place(self) -> bool:
+        """Return whether the file has positions: x and y."""
+        return bool(self.find("pose_x") and self.find("pose_y"))
+
+    @property
+    def has_heading(self) -> bool:
+        """Return whether the file has a heading or a quaternion."""
+        return self.find("pose_heading", "pose_quaternion") is not None
+
+    @property
+    def has_whole_pose(self) -> bool:
+        """Return whether the file has positions, and a heading or a quaternion."""
+        return self.has_place and self.has_heading
 
     def find(self, *channels: str) -> FileChannel | None:
         """Return the first of some channels that the file has, or None if it has none of them."""
@@ -125,9 +134,10 @@ def pose_path(
 ) -> tuple[UnitGuess, Float[np.ndarray, "3 pose"] | None]:
     """Return the unit of the positions in a file, and the time [s], x and y [m] of each pose.
 
-    Times and positions are None if the file has no pose or no time, or if positions are in pixels.
+    Times and positions are None if the file has no positions or no time, or if positions are in
+    pixels.
     """
-    if one is None or not one.has_pose:
+    if one is None or not one.has_place:
         return UnitGuess("m"), None
     logged = one.channel("pose_x").unit
     x, y = (one.channel(name).values[:, 0] for name in ("pose_x", "pose_y"))
@@ -247,8 +257,9 @@ def is_battery_voltage(voltages: Sequence[FileChannel], speed: FileChannel | Non
 
 
 def file_with_pose(studies: Sequence[FileStudy]) -> FileStudy | None:
-    """Return the first file with a pose, or None."""
-    return next((one for one in studies if one.has_pose), None)
+    """Return a file with positions and headings, else one with either of them, or None."""
+    posed = [one for one in studies if one.has_place or one.has_heading]
+    return max(posed, key=lambda one: 2 * one.has_place + one.has_heading, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,8 +285,13 @@ class RunStudy:
 
     @property
     def has_pose(self) -> bool:
-        """Return whether a file of the run has a pose."""
+        """Return whether a file of the run has poses, perhaps without positions or headings."""
         return file_with_pose(self.all) is not None
+
+    @property
+    def has_whole_pose(self) -> bool:
+        """Return whether a file of the run has positions and headings."""
+        return any(one.has_whole_pose for one in self.all)
 
     @property
     def complete(self) -> bool:

@@ -25,6 +25,7 @@ from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import body_steps
 from slipid.support.errors import DataError
 
+_POSE = frozenset((*GROUPS["pose"], "pose_quaternion"))
 _SIDEWAYS = 0.3
 """Share of sideways motion above which a robot can drive sideways [1]."""
 
@@ -91,7 +92,7 @@ def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
         return True
     posed = file_with_pose(files)
     turned = None if posed is None else posed.find("pose_heading")
-    if posed is None or turned is None or not turned.unit:
+    if posed is None or turned is None or not turned.unit or not posed.has_place:
         return None
     pose = np.stack([posed.channel(name).values[:, 0] for name in GROUPS["pose"]], axis=1)
     pose[:, 2] *= factor(turned.unit, "rad")
@@ -147,7 +148,7 @@ class SortedFiles:
 def sort_files(path: Path) -> SortedFiles:
     """Return the log files at a path, sorted.
 
-    If the path is a file without wheels or pose, other files in its folder are added.
+    If the path is a file without wheels or whole poses, other files in its folder are added.
     """
     formats, no_logs = formats_below(path) if path.is_dir() else ([format_of(path)], {})
     presets, others, hints = [], [], []
@@ -162,7 +163,7 @@ def sort_files(path: Path) -> SortedFiles:
                 f"If {kind.paths[0].name} is of the published logs: format = "
                 f"{' or '.join(perhaps)} in [[logs]] reads it, and no layout is needed."
             )
-    if path.is_file() and others and not others[0].complete:
+    if path.is_file() and others and not (others[0].complete and others[0].has_whole_pose):
         others += _siblings(path, others[0].kind)
     groups, left_out = _run_files(others)
     left_out += list(no_logs.values())[:3]
@@ -208,16 +209,19 @@ def _run_files(kinds: list[RunStudy]) -> tuple[list[RunStudy], list[str]]:
         have = frozenset(one.channel for one in main.found) - {"time"}
         for other in rest:
             pattern = pattern_beside(run.kind, other.kind)
-            one = other.main.without(have)
+            # A pose comes from one file, so a whole pose replaces a heading or position elsewhere.
+            better = other.main.has_whole_pose and not main.has_whole_pose
+            one = other.main.without(have - _POSE if better else have)
             fresh = {found.channel for found in one.found} - {"time"}
             if pattern is None or not fresh or one.clock is None or main.clock is None:
                 continue
             if max(main.time[0], one.time[0]) >= min(main.time[-1], one.time[-1]):
                 continue  # the files cannot be of one run, since their times do not overlap
+            main = main.without(_POSE) if better else main
             beside.append((pattern, one))
             have |= fresh
             used.append(other)
-        group = replace(run, beside=tuple(beside))
+        group = replace(run, main=main, beside=tuple(beside))
         groups.append(replace(group, others=_more_runs(group)))
     lost = [run.kind.paths[0] for run in rest if run not in used]
     lines = [f"{path}: it has no wheels, and adds no channel to another file" for path in lost]

@@ -12,7 +12,7 @@ from slipid.app.new.config_text import new_config
 from slipid.app.new.draft import COLUMNS_HELP, ConfigDraft, LayoutDraft, LogsDraft
 from slipid.app.new.file_channels import floor_of, folder_per_run, globs_of
 from slipid.app.new.file_draft import file_draft, radius_hint
-from slipid.app.new.file_study import FileStudy, RunStudy
+from slipid.app.new.file_study import FileStudy, RunStudy, file_with_pose
 from slipid.app.new.guess import SortedFiles, guess_robot, sort_files
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
 from slipid.data.check.columns import refuse_misordered
@@ -70,7 +70,7 @@ def propose(path: Path, options: RobotOptions) -> ConfigDraft:
 
 def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[FileStudy]) -> None:
     """Raise `DataError` for the log of a motor on a bench, which `slipid motor` reads."""
-    if found.presets or wheels > 1 or not files or any(one.has_pose for one in files):
+    if found.presets or wheels > 1 or not files or file_with_pose(files) is not None:
         return
     first = files[0].format.path
     try:
@@ -101,7 +101,7 @@ def _with_preset_gear(robot: RobotAnswers, found: SortedFiles) -> RobotAnswers:
 def _layouts(run: RunStudy, robot: RobotAnswers, name: str) -> list[LayoutDraft]:
     """Return the drafts of the layouts of all files of a run."""
     first = file_draft(name, run.main, run, robot, COLUMNS_HELP)
-    if not run.has_pose:
+    if not run.has_whole_pose:
         first = replace(first, questions=(*first.questions, _missing_pose(run)))
     beside = (
         (f"{name}.beside.{toml(pattern)}", one, f"Of the same run, in {pattern}:")
@@ -112,7 +112,8 @@ def _layouts(run: RunStudy, robot: RobotAnswers, name: str) -> list[LayoutDraft]
 
 def _missing_pose(run: RunStudy) -> str:
     """Return the question about the pose of a run without a whole pose, with what was found."""
-    needed = "a fit needs x, y, and a heading or a quaternion"
+    needed = "motors and contact need x, y, and a heading or a quaternion"
+    needed += "; identify --only calibration does without one of them" if run.has_pose else ""
     parts = [
         f"{name.removeprefix('pose_')} (column {one.format.column(found.columns[0])})"
         for name in (*GROUPS["pose"], "pose_quaternion")

@@ -134,7 +134,7 @@ def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | 
     """
     middle = 0.5 * float(steps.first[0] + steps.last[-1])
     grid = offset + np.arange(-FINE_HALF_WIDTH_S, FINE_HALF_WIDTH_S + FINE_GRID_S, FINE_GRID_S)
-    at, noise = np.array([offset, 0.0]), tuple(StepNoise(0.0, 1.0) for _ in pair.components)
+    at, noise = np.array([offset, 0.0]), tuple(StepNoise(0.0, 1.0) for _ in steps.moved.T)
     for _ in range(2):  # the second search whitens with the noise estimated in the first
         every = [linearised(pair, steps, np.array([o, 0.0]), middle, noise) for o in grid]
         fits = [(near.squares, k, near.noise) for k, near in enumerate(every) if near is not None]

@@ -64,9 +64,12 @@ def _searched(data: Runs) -> PoseLag | None:
     searched range.
     """
     some = np.unique(np.linspace(0, len(data) - 1, MOST_RUNS).round().astype(int)).tolist()
-    pairs = [pair for k in some if len((pair := _pair(data, k)).pose_time) > 1]
+    pairs = [pair for k in some if len((pair := _pair(data, k)).pose_time) > 2]
     if not pairs:
         return None
+    # Runs whose poses have the most coordinates are compared, since one matrix is fitted to all.
+    known = [np.isfinite(pair.pose[0]).sum() for pair in pairs]
+    pairs = [pair for pair, count in zip(pairs, known, strict=True) if count == max(known)]
     usual = float(np.median([pair.time[-1] - pair.time[0] for pair in pairs]))
     most = round(min(LONGEST_LAG_S, (1.0 - LEAST_OVERLAP) * usual) / COARSE_GRID_S)
     coarse = COARSE_GRID_S * np.arange(-most, most + 1)
@@ -83,14 +86,16 @@ def _searched(data: Runs) -> PoseLag | None:
 def _pair(data: Runs, run: int) -> MotionPair:
     """Return the motion pair of one run; its motion is extrapolated beyond the ends of the run."""
     rows = data.rows(run)
-    time, fresh = data.time[rows], data.fresh[rows]
+    time, fresh, pose = data.time[rows], data.fresh[rows], data.pose[rows]
+    seen = fresh & (np.isfinite(pose) == np.isfinite(pose[fresh][0])).all(axis=1)
     return MotionPair(
         time,
         data.wheel_angle[rows],
-        time[fresh],
-        data.pose[rows][fresh],
+        time[seen],
+        pose[seen],
         source="wheels",
         step=STEP_S,
         collinear=1e-9,
+        components=(2,) if np.isnan(pose[seen][0, 0]) else (0, 1, 2),
         goes_on=True,
     )

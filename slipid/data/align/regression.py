@@ -4,11 +4,16 @@
 
 where moved_k is the pose increment over step k, from first_k to last_k [s], turned are the angles
 of the wheels or of the gyro, B is the fitted matrix and e_k the noise. Sizes, signs and order of
-the wheels need not be known, since B absorbs them. The speed must change during the motion, because
-steady motion looks the same at any offset. A search compares offsets by the unexplained fraction of
-the motion; near the best offset, `linearised` gives the derivatives with respect to offset and
-drift under a noise model, in which e is the sum of pose noise, which successive steps share, and of
-slip, which is independent in each step.
+the wheels need not be known, since B absorbs them. Positions without headings show only the length
+of their steps, whose square is a quadratic form of the turns of the wheels:
+
+    |moved_k|^2 = sum_ij B_ij turned_i turned_j + b + e_k
+
+with turned_i short for the difference above, and b for the noise of positions. The speed must
+change during the motion, because steady motion looks the same at any offset. A search compares
+offsets by the unexplained fraction of the motion; near the best offset, `linearised` gives the
+derivatives with respect to offset and drift under a noise model, in which e is the sum of pose
+noise, which successive steps share, and of slip, which is independent in each step.
 """
 
 from collections.abc import Sequence
@@ -47,13 +52,14 @@ class MotionPair:
         time: times of the robot's samples [s].
         turned: angles of the wheels [rad], or other integrals that grow with the motion.
         pose_time: times of the poses on their own clock [s].
-        pose: x, y [m], heading [rad] without wrap-around.
+        pose: x, y [m], heading [rad] without wrap-around; nan in coordinates without a sensor.
         source: sensor that measured `turned`.
         step: shortest duration of the compared pose increments [s].
         collinear: relative threshold below which singular values of the turns are dropped [1]; on a
             straight path the turns of all wheels are proportional, so that some are near zero.
         body_std: std of the delay between the body and `turned` [s].
-        components: indices of the compared components: 0 ahead, 1 left, 2 heading.
+        components: indices of the compared components: 0 ahead, 1 left, 2 heading; of positions
+            without headings, the squares of the lengths of their steps are compared instead.
         goes_on: True to extrapolate the motion beyond the ends of the record at the rates there;
             False to assume standstill there.
     """
@@ -84,8 +90,9 @@ class MotionPair:
         this from a delay of the body: some 10 ms on firm floors, more on carpets. Therefore
         `body_std` is 15 ms.
         """
+        components = (2,) if np.isnan(pose[:, 0]).all() else (0, 1, 2)
         robot = time, angle, pose_time, pose
-        return cls(*robot, "wheels", step=0.1, collinear=0.1, body_std=0.015)
+        return cls(*robot, "wheels", step=0.1, collinear=0.1, body_std=0.015, components=components)
 
     @classmethod
     def of_gyro(
@@ -114,8 +121,28 @@ class MotionPair:
         edges = np.arange(0, len(t), stride)
         first, last = t[edges[:-1]], t[edges[1:]]
         whole = last - first < 2.0 * max(stride * usual, least)
-        moved = body_steps(self.pose[edges])[:, list(self.components)]
+        if self.unheaded:
+            moved = (np.diff(self.pose[edges, :2], axis=0) ** 2).sum(axis=1, keepdims=True)
+        else:
+            moved = body_steps(self.pose[edges])[:, list(self.components)]
         return PoseIncrements(first[whole], last[whole], moved[whole])
+
+    @cached_property
+    def unheaded(self) -> bool:
+        """True if positions are compared whose headings are unknown."""
+        return self.components != (2,) and bool(np.isnan(self.pose[:, 2]).all())
+
+    def regressors(
+        self, turned: Float[np.ndarray, "step column"], change: Float[np.ndarray, "step column"]
+    ) -> tuple[Float[np.ndarray, "step regressor"], Float[np.ndarray, "step regressor"]]:
+        """Return what B multiplies at differences of `turned`, and the change of it at `change`."""
+        if not self.unheaded:
+            return turned, change
+        i, j = np.triu_indices(turned.shape[1])
+        one = np.ones((len(turned), 1))
+        products = turned[:, i] * turned[:, j]
+        slope = turned[:, i] * change[:, j] + change[:, i] * turned[:, j]
+        return np.hstack([products, one]), np.hstack([slope, 0 * one])
 
     def turned_at(self, at: Float[np.ndarray, "*at"]) -> Float[np.ndarray, "*at column"]:
         """Return `turned` interpolated at times on the robot's clock [s]."""
@@ -177,6 +204,7 @@ def unexplained(
     moves = whole > 0
 
     def share(turned: Float[np.ndarray, "step column"]) -> float:
+        turned, _ = pairs[0].regressors(turned, turned)
         if len(turned) < LEAST_PER_COLUMN * turned.shape[1]:
             return 1.0
         rest = moved - turned @ np.linalg.lstsq(turned, moved, rcond=pairs[0].collinear)[0]
@@ -291,13 +319,15 @@ def linearised(
         return None
     first, last, moved = first[inside], last[inside], steps.moved[inside]
     joined = np.concatenate([[False], steps.first[inside][1:] == steps.last[inside][:-1]])
-    turned = pair.turned_at(last) - pair.turned_at(first)
+    differences = pair.turned_at(last) - pair.turned_at(first)
     begins, ends = pair.rate_at(first), pair.rate_at(last)
     since = np.stack([steps.first[inside], steps.last[inside]]) - middle
     by_drift = ends * since[1][:, None] - begins * since[0][:, None]
     residuals, slopes, squares, found = [], [], 0.0, []
+    turned, by_offset = pair.regressors(differences, ends - begins)
+    _, by_drift = pair.regressors(differences, by_drift)
     for y, one in zip(moved.T, noise, strict=True):
-        white = one.whitened(np.column_stack([y, turned, ends - begins, by_drift]), joined)
+        white = one.whitened(np.column_stack([y, turned, by_offset, by_drift]), joined)
         x, *derivatives = np.split(white[:, 1:], 3, axis=1)
         b = np.linalg.lstsq(x, white[:, 0], rcond=pair.collinear)[0]
         by = np.column_stack([derivative @ b for derivative in derivatives])

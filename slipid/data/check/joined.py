@@ -61,7 +61,7 @@ class JoinedRuns:
         row: median time between rows of each run (run,) [s].
         angle: angle of each wheel [rad].
         pose: x [m], y [m], heading [rad] in the rows with a new pose, and in the first and last row
-            of each run.
+            of each run; nan in coordinates that were not measured.
         channels: channels that some run has, keyed by the name of their attribute in `Log`:
             integrals [rad, m] of the rates in `INTEGRATED`, and values of currents [A] and voltages
             [V].
@@ -135,7 +135,7 @@ def joined(data: Runs) -> JoinedRuns:
     time = data.time + np.repeat(starts - first, np.diff(data.offset))
     # The first and last row of a run count as new poses, so that no pose is interpolated between
     # two runs.
-    fresh = data.fresh.copy()
+    fresh = data.fresh | np.isnan(data.pose).all(axis=1)  # no pose may be assumed between such rows
     fresh[data.offset[:-1]] = fresh[data.offset[1:] - 1] = True
 
     channels = {}

@@ -156,6 +156,12 @@ def _compared(
     if usable(moved.wheels).sum() < FEWEST_STEPS:
         return None
     evidence = gather(geometry, at, moved)
+    if not evidence.pose:
+        note = _not_checked(
+            "the poses have positions alone, headings alone or the ends of runs alone: order, "
+            "signs and sizes of the wheels are not compared with them"
+        )
+        return _Compared((*_of_lag(lag), note), moved, evidence)
     declared = agreement(data, at, moved, evidence, Interpretation())
     if declared.still.all():
         return _Compared(tuple(single_runs(data, declared)), moved, evidence)

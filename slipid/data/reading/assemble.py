@@ -218,23 +218,26 @@ def _twist(held: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
 def _pose(
     signals: Mapping[str, Signal], clock: Float[np.ndarray, " time"]
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return the pose at every time, its heading unwrapped, and whether each row has a new pose."""
-    if "pose_x" not in signals:
+    """Return the pose at every time, its heading unwrapped, and whether each row has a new pose.
+
+    Coordinates without a channel are nan.
+    """
+    parts = {k: signals[name] for k, name in enumerate(GROUPS["pose"]) if name in signals}
+    if not parts:
         return None, None
-    parts = [signals[name] for name in GROUPS["pose"]]
-    times = clock_of(parts)
+    times, logged = clock_of([*parts.values()]), [*parts]
     samples = np.full((len(times), 3), np.nan)
-    for k, part in enumerate(parts):
+    for k, part in parts.items():
         samples[np.searchsorted(times, part.time), k] = part.values[:, 0]
-    whole = ~np.isnan(samples).any(axis=1) & (times >= clock[0]) & (times <= clock[-1])
+    whole = ~np.isnan(samples[:, logged]).any(axis=1) & (times >= clock[0]) & (times <= clock[-1])
     times, samples = times[whole], samples[whole]
     if not len(times):
-        raise signals["pose_x"].source.error(
+        raise parts[logged[0]].source.error(
             "no pose while the wheels were measured", "times of both counted from the same start"
         )
     samples[:, 2] = np.unwrap(samples[:, 2])
     new = np.ones(len(times), dtype=bool)
-    new[1:] = np.any(np.diff(samples, axis=0) != 0, axis=1)
+    new[1:] = np.any(np.diff(samples[:, logged], axis=0) != 0, axis=1)
     rows = np.searchsorted(clock, times)
     fresh = np.zeros(len(clock), dtype=bool)
     fresh[rows] = new
@@ -254,17 +257,19 @@ def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]
         UnusablePose: the motion does not determine the offset between the clocks.
     """
     log = assembled(run, layout)
-    parts = [poses[name] for name in GROUPS["pose"]]
-    time = clock_of(parts)
-    x, y, turned = (part.values[:, 0] for part in parts)
-    values = (x, y, np.unwrap(turned))
-    columns = [np.interp(time, p.time, v) for p, v in zip(parts, values, strict=True)]
-    clock = best_clock(_motion_pairs(log, time, np.column_stack(columns)))
+    time = clock_of([*poses.values()])
+    pose = np.full((len(time), 3), np.nan)
+    for k, name in enumerate(GROUPS["pose"]):
+        if name in poses:
+            values = poses[name].values[:, 0]
+            values = np.unwrap(values) if name == "pose_heading" else values
+            pose[:, k] = np.interp(time, poses[name].time, values)
+    clock = best_clock(_motion_pairs(log, time, pose))
     if clock is None:
         raise UnusablePose(
-            f"{parts[0].source.path}: the motion does not determine the offset of its clock from "
-            f"that of {log.name}; expected poses of the same run, with starts, stops and turns in "
-            "both, and the correct frame rate of the video"
+            f"{next(iter(poses.values())).source.path}: the motion does not determine the offset "
+            f"of its clock from that of {log.name}; expected poses of the same run, with starts, "
+            "stops and turns in both, and the correct frame rate of the video"
         )
     # The offset refers to the times of the log, which start at 0 if the robot's clock counts from
     # 1970, so the start that was subtracted is added again.
@@ -280,6 +285,6 @@ def _motion_pairs(
 
     The gyro comes first because it turns exactly with the body, whereas wheels slip.
     """
-    if robot.gyro is not None:
+    if robot.gyro is not None and not np.isnan(pose[:, 2]).any():
         yield MotionPair.of_gyro(robot.time, robot.gyro, time, pose)
     yield MotionPair.of_wheels(robot.time, robot.wheel_angle, time, pose)

@@ -139,12 +139,10 @@ class SensorLayout:
         have = {*channels}
         if "wheel_ticks" in have and self.ticks_per_revolution is None:
             return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
-        turned = {"pose_heading", "pose_quaternion"} & have
-        if 0 < len({"pose_x", "pose_y"} & have) + len(turned) != 3:
-            return (
-                "an incomplete pose; expected x, y and either heading or quaternion, or none of "
-                "them"
-            )
+        if len({"pose_x", "pose_y"} & have) == 1:
+            return "only one of pose_x and pose_y; expected both or neither"
+        if {"pose_heading", "pose_quaternion"} <= have:
+            return "both pose_heading and pose_quaternion; expected only one of them"
         return None
 
 

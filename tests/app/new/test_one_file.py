@@ -36,6 +36,18 @@ def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     assert "2 like" in draft.sentences[0]
 
 
+@pytest.mark.parametrize("lacking", [["yaw"], ["x", "y"]], ids=["positions", "headings"])
+def test_poses_without_headings_or_positions_are_proposed(tmp_path, lacking):
+    path = table(tmp_path / "run1.csv", {n: v for n, v in plain().items() if n not in lacking})
+    _, config = proposed(path, **ROBOT)
+    log = read(config, tmp_path).logs[0]
+    _, pose = motion(log.time)
+    known = np.isfinite(log.pose).all(axis=0)
+    assert known.tolist() == ([True, True, False] if lacking == ["yaw"] else [False, False, True])
+    np.testing.assert_allclose(log.pose[:, known], pose[:, known], atol=1e-6)
+    assert any("was found: motors and contact need x, y" in q for q in config.questions)
+
+
 def test_other_units_follow_from_names_units_row_and_magnitude(tmp_path):
     si = plain()
     lines = {

@@ -135,7 +135,7 @@ def test_a_config_starts_from_a_preset_and_overrides_it(root):
             "metres_per_pixel.2.: -1; .*greater than 0",
         ),
         ({"format": "robotino2022", "columns": {"time": False}}, "no time column"),
-        ({"format": "robotino2022", "columns": {"pose_x": False}}, "an incomplete pose"),
+        ({"format": "robotino2022", "columns": {"pose_x": False}}, "only one of pose_x and"),
         ({"format": "robotino2022", "columns": ["t"]}, "expected a table"),
         ({"format": "robotino2022", "columns": {"gyro": "g"}}, "columns.gyro: 'g'; expected"),
         (
@@ -204,6 +204,19 @@ def test_generic_csv(root):
     np.testing.assert_allclose(log.pose[-1], [0.2 * log.time[-1], 1e-3, math.radians(0.5)])
     assert log.twist_command is None
     assert log.wheel_speed_command is None
+
+
+@pytest.mark.parametrize(
+    ("absent", "lacking"), [(["pose_heading"], [2]), (["pose_x", "pose_y"], [0, 1])]
+)
+def test_poses_may_lack_headings_or_positions(root, absent, lacking):
+    columns = {k: v for k, v in GENERIC_LAYOUT["columns"].items() if k not in absent}
+    log = read_log(root / GENERIC, declared_layout(GENERIC_LAYOUT | {"columns": columns}, "layout"))
+    whole = generic(root)
+    known = [k for k in range(3) if k not in lacking]
+    assert np.isnan(log.pose[:, lacking]).all()
+    np.testing.assert_array_equal(log.pose[:, known], whole.pose[:, known])
+    assert log.pose_fresh[0]
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ GYRO = {"gyro": {"topic": "/imu"}}
             {"topics": {"pose": {"topic": "/p"}, "pose_x": {"topic": "/q", "unit": "m"}}},
             ("pose and pose_x",),
         ),
-        ({"topics": {"pose_x": {"topic": "/q", "unit": "m"}}}, ("an incomplete pose",)),
+        ({"topics": {"pose_x": {"topic": "/q", "unit": "m"}}}, ("only one of pose_x and pose_y",)),
         ({"topics": {"wheel_ticks": {"topic": "/m"}}}, ("without ticks_per_revolution",)),
         ({"topics": GYRO, "joints": ["a", "a"]}, ("each name only once",)),
         ({"topics": GYRO, "stamp": "sent"}, ("stamp", "'header' or 'received'")),
