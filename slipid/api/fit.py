@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slipid.app.calibrate import calibrated
 from slipid.app.config import FitSection
 from slipid.app.identify import optimised, summarised
 from slipid.app.problem import FitTask, of_torques, robot_for_runs, stated_sizes
@@ -76,8 +77,10 @@ def fit(
     chosen = priors or {}, fixed or {}, start or {}, free
     task = fit_task_of(runs, robot, *chosen, image_centre, windows_per_piece, seed)
     with Reporter(quiet=quiet) as report:
+        kinematic = calibrated(task, report)
+        task = task.started_from(kinematic.calibration)
         problem, optimum = optimised(task, task.problem(), None, report)
-        return summarised(task, problem, optimum, report)
+        return summarised(task, problem, optimum, report, kinematic)
 
 
 def fit_task_of(
@@ -94,6 +97,7 @@ def fit_task_of(
     """Return the fit task of runs and choices; the arguments are those of `fit`."""
     full = robot_for_runs(robot, runs, image_centre)
     choices = [*fixed_viscosities(runs), *stated_sizes(full, float(full.body.mass))]
+    before = len(choices)
     choices += [Choice(path, free=True) for path in free]
     for path, prior in priors.items():
         choices.append(
@@ -103,7 +107,8 @@ def fit_task_of(
     choices += [Choice(path, start=_json_numbers(value)) for path, value in start.items()]
     choices += of_torques(runs, full)
     settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)
-    return FitTask(runs, full, tuple(choices), settings)
+    user = len(choices) - before
+    return FitTask(runs, full, tuple(choices), settings, user_choices=user)
 
 
 def _json_numbers(value: Numbers) -> float | list[float]:

@@ -304,7 +304,7 @@ class FitSection(Section):
         windows_per_piece: number of neighbouring windows in a segment, which the fit treats as one
             observation.
         longest_window_s: longest duration of a window; if windows would be longer, a run gets more
-            segments.
+            segments. By default as long as the wheels keep nearly constant speeds, .75 to 6 s.
         rounds: largest number of rounds of the fit; each optimises the parameters and then the
             noise variances.
         tolerance: the fit ends when no parameter changes by more than this fraction of its standard
@@ -314,7 +314,7 @@ class FitSection(Section):
 
     lengths_from: Literal["poses", "wheels"] | None = None
     windows_per_piece: int = Field(default=4, ge=1, le=32)
-    longest_window_s: Positive = 6.0
+    longest_window_s: Positive | None = None
     rounds: int = Field(default=30, ge=1)
     tolerance: Positive = 0.02
     seed: int = Field(default=0, ge=0)

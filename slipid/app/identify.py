@@ -1,7 +1,4 @@
-"""Fit of a robot to the logs of a config or to runs, with verdicts and result files.
-
-One of the verdicts compares the fit's open-loop predictions of its own runs with encoder odometry.
-"""
+"""Fit of a robot to the logs of a config or to runs, with verdicts and result files."""
 
 import math
 import time
@@ -12,13 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from slipid.app.bench_priors import COPY_NAME
+from slipid.app.calibrate import calibrated, remarks, write_run
 from slipid.app.check import sanity
 from slipid.app.config import read_config
-from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.data.check.findings import wrong
-from slipid.data.runs import Runs
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise
@@ -26,13 +21,15 @@ from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
-from slipid.infer.verdicts.disputed import EndPoints, Trust, verdict_of_trust
 from slipid.infer.verdicts.profile import Profile, profile, profiled
-from slipid.predict import open_loop as replay
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
-from slipid.predict.kinematics import Encoder
-from slipid.predict.slip_models import FloorModels, slip_models
-from slipid.predict.validation import ScoredRun, add_scores
+from slipid.predict.selection import (
+    KinematicFit,
+    calibrated_model,
+    contact_errors,
+    selected,
+)
+from slipid.predict.slip_models import slip_models
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_json
@@ -53,14 +50,12 @@ class IdentifyResult:
     Attributes:
         fit: the fit.
         task: runs, config and choices from which the fit was made.
-        trust: verdict on the fit by its open-loop predictions.
         profiles: profile likelihoods that were requested.
         written: names of the written files.
     """
 
     fit: Fit
     task: ConfigFitTask
-    trust: Trust
     profiles: tuple[Profile, ...]
     written: tuple[str, ...]
 
@@ -90,13 +85,10 @@ def identify(
         DataError: config or logs are wrong; in this case nothing was written.
     """
     began = time.monotonic()
-    setup_jax(quiet=True)
-    config = read_config(config_path)
-    task = read_fit_task(config, data, report)
-    report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")
-    _check_sanity(task, report, anyway)
-    task = with_mixed(task, data, report)
-    report.stage("cutting windows")
+    task = with_mixed(checked_task(config_path, data, report, anyway), data, report)
+    config = task.config
+    kinematic = calibrated(task, report)
+    task = task.started_from(kinematic.calibration)
     problem = task.problem()
     for path in profiles:
         try:
@@ -109,12 +101,10 @@ def identify(
     key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
     kept = Checkpoint(out, key)
     problem, optimum = optimised(task, problem, kept, report)
-    fit = summarised(task, problem, optimum, report)
-    report.stage("predicting the fitted runs")
-    trust = trust_report(fit, task.dataset)
+    fit = summarised(task, problem, optimum, report, kinematic)
     report.stage("writing")
     written = (*save(fit, out), "run.json", "config.toml")
-    _write_run(task, trust, data, out, time.monotonic() - began)
+    write_run(task, fit.trust, data, out, time.monotonic() - began)
     if profiles and task.mixed:
         report.line("profiles use only the runs on one floor each")
 
@@ -130,7 +120,16 @@ def identify(
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written = (*written, "profile.json")
     kept.remove(f"{CHECKPOINT}.npz")
-    return IdentifyResult(fit, task, trust, tuple(result), written)
+    return IdentifyResult(fit, task, tuple(result), written)
+
+
+def checked_task(config_path: Path, data: Path, report: Reporter, anyway: bool) -> ConfigFitTask:
+    """Return the fit task of a config whose runs do not contradict it; arguments of `identify`."""
+    setup_jax(quiet=True)
+    task = read_fit_task(read_config(config_path), data, report)
+    report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")
+    _check_sanity(task, report, anyway)
+    return task
 
 
 def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
@@ -159,19 +158,6 @@ def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
     for finding in found:
         if finding.severity != "note":
             report.line(f"{finding.severity}: {finding}")
-
-
-def _write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:
-    """Write run.json, and copies of the config and the bench file, which later commands read."""
-    config = task.config
-    if (bench := config.content.wheels.motor) is not None:
-        write_json(
-            out / COPY_NAME, read_json(config.path.parent / bench, "the parameters of a motor")
-        )
-    logs = {log.name: log.sha256 for log in task.logs}
-    inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}
-    verdict = {"trust": trust.to_json(), "seed": task.settings.seed}
-    write_run_file(out, config, inputs, seconds, verdict)
 
 
 def optimised(
@@ -250,15 +236,27 @@ def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | Non
     return start, history
 
 
-def summarised(task: FitTask, problem: Problem, optimum: Optimum, report: Reporter) -> Fit:
+def summarised(
+    task: FitTask, problem: Problem, optimum: Optimum, report: Reporter, kinematic: KinematicFit
+) -> Fit:
     """Return the fit from an optimum, with intervals, verdicts and simpler models for comparison.
 
-    Runs over several floors, if the task has some, are fitted as well.
+    The slip model of every floor is selected. Runs over several floors, if the task has some, are
+    fitted as well.
     """
     report.stage("intervals and verdicts")
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
         fit = _with_mixed_runs(fit, task, problem, optimum, report)
+    report.stage("predicting held-out runs")
+    contact = contact_errors(task.dataset, problem, optimum)
+    selection = selected(task.dataset, {**kinematic.errors, "contact": contact})
+    fit = replace(
+        fit,
+        calibration=kinematic.calibration,
+        selection=selection,
+        suspects=remarks(kinematic, selection),
+    )
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
 
@@ -320,47 +318,12 @@ def _mixed_sentence(about: Mapping[str, Any]) -> str:
 
 
 def _with_baselines(fit: Fit, task: FitTask) -> Fit:
-    """Return the fit with simpler models, fitted to the same runs with the fit's camera and lag."""
-    cut, shape = task.windows(fit.robot), fit.space.template.geometry
-    learnt = [model.fit(cut, fit.robot) for model in slip_models(shape, fit.channels.current)]
+    """Return the fit with simpler models, fitted to the same runs with the calibrated sensor."""
+    seen, shape = fit.seen, fit.config_shape
+    cut = task.windows(seen)
+    learnt = [model.fit(cut, seen) for model in slip_models(shape, fit.channels.current)]
+    if fit.calibration is not None:
+        own = calibrated_model(fit.calibration, shape)
+        learnt = [own if model.name == own.name else model for model in learnt]
     plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}
     return replace(fit, baselines=plain)
-
-
-ENCODER = FloorModels(Encoder())
-MOST_RUNS = 24
-"""Largest number of predicted runs on each floor, which are picked evenly from the fitted runs."""
-
-
-def trust_report(fit: Fit, data: Runs) -> Trust:
-    """Return the verdict on a fit from open-loop predictions of the runs that it was fitted to."""
-    some = data.subset(_picked(data))
-    runs: dict[int, ScoredRun] = {}
-    try:
-        cuts = replay.replay_windows(some, fit.robot)
-    except DataError:  # the fitted lag may be so large that a short run has no windows
-        cuts = []
-    for w in cuts:
-        plain = replay.tracks_from_increments(fit.robot, w, ENCODER.increments(w, fit.robot))
-        for name, tracks in ((fit.contact.name, fit.contact.tracks(w)), (ENCODER.name, plain)):
-            add_scores(runs, some, name, tracks, None)
-    errors: dict[str, list[list[float]]] = {}
-    for run in runs.values():
-        off = [score.endpoint_error_over_path for score in run.models.values()]
-        errors.setdefault(run.surface, []).append(off)
-    floors = {
-        name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
-    }
-    return verdict_of_trust(floors, fit.converged, fit.parameters.values(), len(runs))
-
-
-def _picked(data: Runs) -> list[int]:
-    """Return the indices of at most `MOST_RUNS` runs on every floor."""
-    of_floor: dict[str, list[int]] = {}
-    for k, log in enumerate(data.logs):
-        of_floor.setdefault(log.surface or "unknown", []).append(k)
-    out = []
-    for runs in of_floor.values():
-        at = np.unique(np.linspace(0, len(runs) - 1, MOST_RUNS).round().astype(int))
-        out += [runs[k] for k in at]
-    return sorted(out)

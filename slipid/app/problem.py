@@ -7,9 +7,11 @@ is used, as if all wheels were equally stiff.
 """
 
 import fnmatch
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from jaxtyping import Float
@@ -29,10 +31,12 @@ from slipid.data.check.columns import refuse_misordered
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
-from slipid.data.windows import Windows, windows
+from slipid.data.windows import Windows, steady_duration, windows
+from slipid.fitting.calibration import Calibration
 from slipid.fitting.problem import Problem, fixed_viscosities
 from slipid.infer.bench.motor import BenchRoot
 from slipid.model.geometry import Geometry
+from slipid.model.kinematics import is_axle
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
@@ -115,6 +119,7 @@ class FitTask:
         choices: free, fixed and prior values of parameters.
         settings: length of the windows, and limits of the optimisation.
         mixed: sets of runs over several floors, each with the map of the floors.
+        user_choices: number of the last choices that the user made.
     """
 
     dataset: Runs
@@ -122,6 +127,23 @@ class FitTask:
     choices: tuple[Choice, ...]
     settings: FitSection
     mixed: tuple[tuple[Runs, FloorMap], ...] = ()
+    user_choices: int = 0
+
+    @cached_property
+    def longest_window(self) -> float:
+        """Longest duration of a window [s]: the one set, or as long as the wheels are steady."""
+        return self.settings.longest_window_s or steady_duration(self.dataset)
+
+    def started_from(self, found: Calibration) -> Self:
+        """Return the same task, starting from a calibration.
+
+        Lengths, lag and the place of the pose sensor that the calibration has determined are fitted
+        with priors around the config's lengths, unless the user decided otherwise.
+        """
+        split = len(self.choices) - self.user_choices
+        space = Space(self.robot, self.choices)
+        more = geometry_choices(found, self.robot.geometry, {e.path for e in space.free})
+        return replace(self, choices=(*self.choices[:split], *more, *self.choices[split:]))
 
     @property
     def logs(self) -> tuple[Log, ...]:
@@ -164,7 +186,7 @@ class FitTask:
             float(robot.geometry.wheel_radius),
             lag=float(robot.camera.lag),
             per_segment=self.settings.windows_per_piece,
-            longest=self.settings.longest_window_s,
+            longest=self.longest_window,
         )
 
 
@@ -291,8 +313,14 @@ def fit_task(
             f"{log.name}: no steering angle; expected the channel steering_angle in the layout of "
             "every log, since robot.drive is 'steered'"
         )
+    if shape.driven is None and dataset.steering is not None:
+        raise DataError(
+            f"{config.path}: robot.drive is '{config.content.wheels.drive}', which has no steered "
+            "wheel, but a layout has the channel steering_angle; remove this channel, or describe "
+            "the robot with drive = 'steered'"
+        )
     robot = robot_for_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
-    choices, left_out = _choices(config, robot)
+    choices, left_out, by_user = _choices(config, robot)
     # A lag that the config sets is not replaced by the lag that the motion shows.
     given = any(fnmatch.fnmatchcase("camera.lag", p) for p in config.content.parameters)
     lag = [] if given else lag_from_motion(dataset)
@@ -313,7 +341,77 @@ def fit_task(
     for sentence in skipped:
         report.line(sentence)
     settings = config.content.fit
-    return ConfigFitTask(dataset, robot, tuple(choices), settings, config=config, skipped=skipped)
+    return ConfigFitTask(
+        dataset,
+        robot,
+        tuple(choices),
+        settings,
+        user_choices=by_user,
+        config=config,
+        skipped=skipped,
+    )
+
+
+PLACE_STD = 0.5
+"""Std of the prior of the pose sensor's place, as a fraction of the track or base [1]."""
+BASE_STD, SIDES_STD = 0.1, 0.02
+"""Stds of the priors of the base radius, relative to the config's, and of the deviations of the
+drives' radii from their mean [1]."""
+
+
+def geometry_choices(found: Calibration, shape: Geometry, free: Collection[str]) -> list[Choice]:
+    """Return choices that fit the geometry which a calibration has determined, starting from it.
+
+    The base radius is that of the force balance only for wheels on one axle and for wheels that
+    determine the twist: the effective track of a skid steer follows from its slip. Radii of the
+    drives are fitted for wheels that point ahead only, since on omni wheels slip that depends on
+    the load looks the same.
+
+    Args:
+        found: the calibration.
+        shape: geometry of the config.
+        free: paths of the parameters that are fitted anyway.
+    """
+    told = ("identified", "weak")
+    radii = np.array([v.value for v in found.radius[found.firmest]])
+    base, out = found.base[found.firmest], []
+    if found.lag.verdict in told:
+        lag = found.lag.value
+        out.append(Choice("camera.lag", start=lag, prior_mean=lag, prior_std=LAG_STD, free=True))
+    if all(v.verdict in told for v in found.offset):
+        place = [v.value for v in found.offset]
+        std = PLACE_STD * found.nominal_base
+        out.append(
+            Choice(
+                "camera.marker_place", start=place, prior_mean=[0.0] * 2, prior_std=std, free=True
+            )
+        )
+    if "robot.wheel_radius" in free:
+        out.append(Choice("robot.wheel_radius", start=float(radii.mean())))
+    if not shape.determines_twist and all(v.verdict in told for v in found.radius[found.firmest]):
+        deviation = (radii / radii.mean() - 1).tolist()
+        zero = [0.0] * len(deviation)
+        out.append(
+            Choice(
+                "robot.radius_deviation",
+                start=deviation,
+                prior_mean=zero,
+                prior_std=SIDES_STD,
+                free=True,
+            )
+        )
+    if base.verdict in told and (shape.determines_twist or is_axle(shape)):
+        nominal = float(shape.base_radius)
+        out.append(
+            Choice(
+                "robot.base_radius",
+                start=nominal * base.value / found.nominal_base,
+                prior_mean=nominal,
+                prior_std=BASE_STD * nominal,
+                free=True,
+            )
+        )
+    return out
 
 
 def lag_from_motion(dataset: Runs) -> list[Choice]:
@@ -401,8 +499,8 @@ def stated_sizes(robot: Robot, mass: float) -> list[Choice]:
     return choices
 
 
-def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
-    """Return the config's choices for parameters, and lines about them.
+def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str], int]:
+    """Return choices for parameters, lines about them, and the number of those in `[parameters]`.
 
     The lines name the parameters with a prior from the bench file, and choices that apply to no
     run.
@@ -422,6 +520,7 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
             choices.append(prior)
         else:
             skipped.append(f"skipped: weights.{load}: no run has this load set-up")
+    before = len(choices)
     for pattern in config.content.parameters:
         if not fnmatch.filter(paths, pattern):
             if fnmatch.filter(paths, _any_label(pattern)):
@@ -431,7 +530,7 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
                 continue
             raise unknown_parameter(config, pattern, pattern, paths)
         choices.append(checked_choice(config, pattern, pattern, robot))
-    return choices, skipped
+    return choices, skipped, len(choices) - before
 
 
 def unknown_parameter(config: Config, pattern: str, name: str, paths: list[str]) -> DataError:

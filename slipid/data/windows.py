@@ -128,6 +128,36 @@ def windows(
     )
 
 
+DURATIONS_S, STEADY = (6.0, 3.0, 1.5, 0.75), 0.04
+"""Durations of windows [s], and largest deviation of wheel angles from constant speeds in a window,
+as a fraction of their turn [1]."""
+MOST_STEADY_RUNS = 24
+"""Largest number of runs from which the duration of windows is chosen."""
+
+
+def steady_duration(data: Runs) -> float:
+    """Return the longest duration over which wheels keep nearly constant speeds [s].
+
+    A window has one body twist: a longer one would average over turns and straight parts.
+    """
+    some = np.unique(np.linspace(0, len(data) - 1, MOST_STEADY_RUNS).round().astype(int))
+    for duration in DURATIONS_S[:-1]:
+        bent, whole = 0.0, 0.0
+        for k in some.tolist():
+            rows = data.rows(k)
+            t, angle = data.time[rows], data.wheel_angle[rows]
+            edges = np.arange(t[0], t[-1], duration)
+            if len(edges) > 1:
+                line = interpolate(edges, interpolate(t, angle, edges), t)
+                bent += float(np.abs(angle - line).mean(axis=0).max()) * (len(edges) - 1)
+                whole += float(
+                    np.abs(np.diff(interpolate(t, angle, edges), axis=0)).sum(axis=0).max()
+                )
+        if bent < STEADY * whole:
+            return duration
+    return DURATIONS_S[-1]
+
+
 def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
     """Return the variance of a single reading of each ammeter in each run [A^2].
 
@@ -228,7 +258,7 @@ def _cut(
         noise: variance of a single reading of each ammeter [A^2].
     """
     rows = data.rows(run)
-    t, angle = data.time[rows], data.wheel_angle[rows]
+    t, angle = data.time[rows], data.turned(run)
     at = t[edges] - lag
     half = SPEED_S / 2
     turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))

@@ -51,8 +51,7 @@ from slipid.fitting.innovations import (
     sensor_yaw,
     start_headings,
 )
-from slipid.model.geometry import Geometry
-from slipid.model.kinematics import Kinematics, Steering, is_axle, nominal_base
+from slipid.model.kinematics import Kinematics, Steering, is_axle, nominal_base, nominal_steering
 from slipid.model.robot import Robot
 from slipid.parameter import as_numbers
 from slipid.search_space import Choice, Space
@@ -92,6 +91,8 @@ MOST_ROUNDS, MOST_STEPS, SETTLED = 6, 5, 0.1
 rounds end [std]."""
 RECUT_S = 0.02
 """Change of the lag after which wheel turns are computed anew [s]."""
+MOST_START = 64
+"""Number of runs above which a calibration starts from that of so many of them."""
 NOISE_TRACKS = 12
 """Largest number of runs on each floor from which variances are estimated."""
 _TYPICAL = np.log(np.array([0.003, 0.005, 0.005, 0.005, 0.01, 0.005, 0.005, 0.01]) ** 2)
@@ -226,7 +227,8 @@ class Calibration:
     def numbers(self, floor: str) -> Float[np.ndarray, " number"]:
         """Return log radius ratios of the drives, log base ratio, and centre [m] on a floor.
 
-        Ratios are to the config's lengths.
+        Ratios are to the config's lengths. Zero [rad], gain and understeer [s^2/m] of the steering
+        follow if a wheel is steered.
 
         Raises:
             ValueError: the floor was not calibrated.
@@ -235,7 +237,9 @@ class Calibration:
             raise ValueError(f"no surface '{floor}'; calibrated: {', '.join(self.radius)}")
         radius = [np.log(v.value / self.nominal_radius) for v in self.radius[floor]]
         centre = self.centre[floor].value if floor in self.centre else 0.0
-        return np.array([*radius, np.log(self.base[floor].value / self.nominal_base), centre])
+        steering = [v.value for name, v in self.steering.items() if name != "wheelbase_m"]
+        base = np.log(self.base[floor].value / self.nominal_base)
+        return np.array([*radius, base, centre, *steering])
 
     def seen(self, robot: Robot) -> Robot:
         """Return a robot whose poses are measured by the calibrated pose sensor."""
@@ -508,14 +512,6 @@ def _floors_with_turns(space: Space, data: Runs) -> set[str]:
     return {f for f, x in turned.items() if max(x) > WHOLE_TURN or np.mean(x) > MEAN_TURN}
 
 
-def _nominal(shape: Geometry) -> tuple[Float[np.ndarray, "3 drive"], Steering | None]:
-    """Return the matrix from wheel turns to body increments, and the steering, by the config."""
-    matrix = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
-    if shape.driven is None:
-        return matrix, None
-    return matrix, Steering(nominal_base(shape), 0.0, 1.0, 0.0, float(shape.driven == "front"))
-
-
 def _is_fixed(choices: Sequence[Choice], path: str) -> bool:
     """Return whether the last choice about a parameter fixes it."""
     mine = [c for c in choices if fnmatchcase(path, c.pattern)]
@@ -545,6 +541,7 @@ class _Fit:
         log_variance: logarithms of the variances: of positions and headings, then for each floor
             six of the motion, as in `innovations`.
         weight: weight of each track [1].
+        runs: indices of the runs from which tracks are cut, None for all.
     """
 
     model: _Model
@@ -553,6 +550,7 @@ class _Fit:
     z: Float[np.ndarray, " free"]
     log_variance: Float[np.ndarray, " variance"]
     weight: Float[np.ndarray, " track"]
+    runs: Int[np.ndarray, " some"] | None = None
 
     @cached_property
     def floor(self) -> Int[np.ndarray, " track"]:
@@ -666,12 +664,8 @@ class _Fit:
 
     def with_noise(self) -> "_Fit":
         """Return the fit with variances of largest posterior, from some of the tracks."""
-        some = []
-        for k in range(len(self.model.floors)):
-            mine = np.flatnonzero(self.floor[: len(self.tracks.run)] == k)
-            at = np.linspace(0, len(mine) - 1, min(NOISE_TRACKS, len(mine)))
-            some.append(mine[at.round().astype(int)])
-        part = self.of_tracks(np.concatenate(some))
+        floor = self.floor[: len(self.tracks.run)]
+        part = self.of_tracks(_evenly(floor, NOISE_TRACKS * len(np.unique(floor))))
         typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:], len(self.model.floors))])
         numbers = part.motion(self.z)
 
@@ -724,6 +718,30 @@ def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calib
     Raises:
         DataError: no run has two poses.
     """
+    return _result(_fitted(data, space, choices))
+
+
+def cross_calibrated(
+    data: Runs, space: Space, choices: Sequence[Choice], fold: Int[np.ndarray, " run"]
+) -> tuple[Calibration, dict[int, Calibration]]:
+    """Return the calibration from all runs, and for each fold that from all runs outside it.
+
+    The latter follow from the former by one Gauss-Newton step, which is exact for numbers in which
+    the poses are linear. Arguments are those of `calibrate`; runs with fold -1 are never left out.
+    """
+    fit = _fitted(data, space, choices)
+    (r, slope), (_, a) = fit.linear, fit.gradient
+    of_track, without = fold[fit.tracks.run], {}
+    for k in sorted(set(of_track.tolist()) - {-1}):
+        mine = np.flatnonzero(of_track == k)
+        inner = np.einsum("nmi,nmj->ij", slope[mine], slope[mine])
+        pull = np.einsum("nmi,nm->i", slope[mine], r[mine])
+        without[k] = _result(replace(fit, z=fit.z + np.linalg.solve(a - inner, pull)), rough=True)
+    return _result(fit), without
+
+
+def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
+    """Return the end of a calibration; arguments are those of `calibrate`."""
     model = _Model.of(space, choices, data, 0)
     z = np.array([model.numbers[name].mean for name in model.free])
     lag = pose_lag(data)
@@ -731,6 +749,16 @@ def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calib
         z[model.free.index("lag")] = lag.seconds
     typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:] + 2.0, len(model.floors))])
     fit = _started(model, data, z, typical)
+    if len(data) <= MOST_START:
+        return _rounds(fit, choices)
+    # Many runs only refine what a part of them has found.
+    some = _evenly([log.surface or "unknown" for log in data.logs], MOST_START)
+    part = _rounds(_cut(replace(fit, runs=some)), choices)
+    return _rounds(_cut(replace(part, runs=None)), choices)
+
+
+def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
+    """Return the fit after rounds that estimate the numbers, the variances and the weights."""
     for _ in range(MOST_ROUNDS):
         before = fit
         fit = fit.solved().with_noise().with_weights()
@@ -743,8 +771,18 @@ def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calib
             and _in_stds(fit.z - before.z, fit.gradient[1]) < SETTLED
         ):
             break
+    return fit
 
-    return _result(fit, len(data))
+
+def _evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
+    """Return indices of at most about `most` elements, evenly from each floor."""
+    label = np.asarray(floors)
+    some, names = [], np.unique(label)
+    for name in names:
+        mine = np.flatnonzero(label == name)
+        at = np.linspace(0, len(mine) - 1, min(int(np.ceil(most / len(names))), len(mine)))
+        some.append(mine[at.round().astype(int)])
+    return np.concatenate(some)
 
 
 def _in_stds(
@@ -757,9 +795,9 @@ def _in_stds(
 def _cut(fit: _Fit) -> _Fit:
     """Return the fit with the tracks cut at the present lag."""
     shape = fit.model.space.template.geometry
-    nominal, steering = _nominal(shape)
+    nominal = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
     arm, lag = 0.5 * nominal_base(shape), float(fit.model.column("lag", fit.z))
-    tracks = pose_tracks(fit.data, lag, nominal, arm, steering)
+    tracks = pose_tracks(fit.data, lag, nominal, arm, nominal_steering(shape), fit.runs)
     return replace(fit, tracks=tracks, weight=np.ones(len(tracks.pose)))
 
 
@@ -817,10 +855,14 @@ def _changes(fit: _Fit) -> Float[np.ndarray, "part free"]:
     return np.array(out)
 
 
-def _result(fit: _Fit, runs: int) -> Calibration:
-    """Return the calibration with intervals and verdicts."""
+def _result(fit: _Fit, rough: bool = False) -> Calibration:
+    """Return the calibration with intervals and verdicts; `rough` ones have too narrow intervals.
+
+    Rough intervals save the time of the jackknife where only the values are used.
+    """
     model, z = fit.model, fit.z
-    covariance, changes = np.linalg.inv(fit.gradient[1]), _changes(fit)
+    changes = np.zeros((2, len(z))) if rough else _changes(fit)
+    covariance = np.zeros((len(z), len(z))) if rough else np.linalg.inv(fit.gradient[1])
     count = len(changes)
     off = changes - changes.mean(axis=0)
 
@@ -874,7 +916,7 @@ def _result(fit: _Fit, runs: int) -> Calibration:
         nominal_radius=radius,
         nominal_base=base,
         noise=_noise(fit),
-        runs=runs,
+        runs=len(fit.data),
     )
 
 

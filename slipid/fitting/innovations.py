@@ -87,6 +87,7 @@ def pose_tracks(
     nominal: Float[np.ndarray, "3 drive"],
     arm: float,
     steering: Steering | None = None,
+    runs: Int[np.ndarray, " some"] | None = None,
 ) -> PoseTracks:
     """Return the poses of runs whose true times, earlier by `lag` [s], have wheel angles.
 
@@ -96,14 +97,16 @@ def pose_tracks(
         nominal: matrix from wheel turns [rad] to body increments by which distances are computed.
         arm: distance that a yaw of 1 rad counts as [m].
         steering: numbers of a robot that steers by which distances are computed; else None.
+        runs: indices of the runs, None for all.
 
     Raises:
         DataError: no run has two such poses.
     """
-    most = int(np.clip(ALL_POSES // len(data), LEAST_POSES, MOST_POSES))
-    picked = [_picked(data, k, lag, most) for k in range(len(data))]
-    rows = [_without_gaps(data, k, some, most) for k, some in enumerate(picked)]
-    kept = [k for k, some in enumerate(picked) if len(some) > 1]
+    every = range(len(data)) if runs is None else runs.tolist()
+    most = int(np.clip(ALL_POSES // len(every), LEAST_POSES, MOST_POSES))
+    picked = {k: _picked(data, k, lag, most) for k in every}
+    rows = {k: _without_gaps(data, k, some, most) for k, some in picked.items()}
+    kept = [k for k, some in picked.items() if len(some) > 1]
     if not kept:
         raise DataError(
             f"{data.logs[0].name}: no two poses with wheel angles at the same time, in this run "

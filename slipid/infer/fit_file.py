@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from slipid.fitting.calibration import Calibration
 from slipid.fitting.shared_effects import FittedEffects, SpeedAndLoad
 from slipid.infer.result import Channels, Fit
 from slipid.infer.slip_curves import SlipCurve
@@ -23,6 +24,7 @@ from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, Validity, build
 from slipid.parameter import entries
+from slipid.predict.selection import FloorSelection
 from slipid.search_space import Choice, Space, with_values
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -30,7 +32,7 @@ from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
-SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/6"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/7"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
 _SHARED = ("std", "coefs", "by_number", "covariance")
@@ -131,7 +133,19 @@ def identified_json(fit: Fit) -> Content:
         "curves": curves_json(fit.curves),
         "validity": {floor: asdict(v) for floor, v in fit.validity.items()},
         "messages": list(fit.messages),
+        **_selected_json(fit),
         "data": {"hash": fit.data_hash, "runs": [name for name, _ in fit.runs]},
+    }
+
+
+def _selected_json(fit: Fit) -> Content:
+    """Return the parts of identified.json about calibration, selected models and trust."""
+    if fit.calibration is None:
+        return {}
+    return {
+        "calibration": fit.calibration.to_json(),
+        "selected_model": {floor: one.model for floor, one in fit.selection.items()},
+        "trust": fit.trust.to_json(),
     }
 
 
@@ -187,6 +201,9 @@ def to_json(fit: Fit) -> Content:
         },
         "extrapolation": dict(fit.extrapolation),
         "baselines": dict(fit.baselines),
+        "calibration": None if fit.calibration is None else fit.calibration.to_json(),
+        "selection": {floor: one.to_json() for floor, one in fit.selection.items()},
+        "suspects": list(fit.suspects),
         "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
     }
 
@@ -222,6 +239,9 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         refused=settings.get("refused"),
         extrapolation=content["extrapolation"],
         baselines=content["baselines"],
+        calibration=content["calibration"] and Calibration.of_json(content["calibration"]),
+        selection={f: FloorSelection.of_json(x) for f, x in content["selection"].items()},
+        suspects=tuple(content["suspects"]),
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
         shared={
             floor: FittedEffects(

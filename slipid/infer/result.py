@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.runs import Runs
+from slipid.fitting.calibration import Calibration
 from slipid.fitting.noise import POOLED
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
@@ -23,10 +24,14 @@ from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import disputes, marked
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
+from slipid.infer.verdicts.trust import Trust, verdict_of_trust
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
+from slipid.model.geometry import Geometry
+from slipid.model.kinematics import with_lengths
 from slipid.model.robot import Robot, Validity
 from slipid.predict.predictive import ForceBalance
 from slipid.predict.ranking import Comparison, compared
+from slipid.predict.selection import FloorSelection
 from slipid.predict.slip_models import restored
 from slipid.predict.validation import Validation, validation
 from slipid.search_space import Choice, Space
@@ -94,6 +99,10 @@ class Fit:
         lag: camera lag for which the windows were cut [s].
         seed: seed of the draws from which the bands of the curves are computed.
         baselines: fitted parameters of simpler slip models, for comparison.
+        calibration: calibrated kinematics and pose sensor; None for a fit without them.
+        selection: selected slip model and errors of held-out runs, keyed by floor; empty if no
+            model was selected.
+        suspects: suspected errors in logs and config, one sentence each.
         mixed: test of the runs over several floors: their prediction errors in a fit to all other
             runs, and in fits that include half of them; and the end-point errors of the runs on one
             floor, keyed by floor, before and after the runs over several floors were added.
@@ -123,6 +132,9 @@ class Fit:
     lag: float
     seed: int
     baselines: Mapping[str, Any] = field(default_factory=dict)
+    calibration: Calibration | None = None
+    selection: Mapping[str, FloorSelection] = field(default_factory=dict)
+    suspects: tuple[str, ...] = ()
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None
@@ -185,8 +197,28 @@ class Fit:
         Raises:
             DataError: a run has a floor or a load set-up that was not identified.
         """
-        models = restored(self.space.template.geometry, dict(self.baselines))
-        return validation(self.contact, models, runs, self.new_runs(runs))
+        models = restored(self.config_shape, dict(self.baselines))
+        chosen = {floor: one.model for floor, one in self.selection.items()}
+        return validation(self.contact, models, runs, self.new_runs(runs), self.seen, chosen)
+
+    @property
+    def config_shape(self) -> Geometry:
+        """Geometry with the lengths of the config, which the fit may have changed."""
+        shape: Geometry = self.space.template.geometry
+        if self.calibration is None:
+            return shape
+        return with_lengths(shape, self.calibration.nominal_radius, self.calibration.nominal_base)
+
+    @property
+    def seen(self) -> Robot:
+        """The fitted robot with the calibrated pose sensor, by which simpler models are judged."""
+        return self.robot if self.calibration is None else self.calibration.seen(self.robot)
+
+    @cached_property
+    def trust(self) -> Trust:
+        """Trust in the models that were selected on the floors."""
+        parameters = self.parameters.values()
+        return verdict_of_trust(self.selection, self.converged, parameters, self.suspects)
 
     def new_runs(self, data: Runs) -> int:
         """Return the number of runs that the fit does not contain."""

@@ -2,16 +2,12 @@
 
 from collections.abc import Iterable
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from slipid.data.runs import Runs
+from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
-from slipid.fitting.problem import Problem, log_jacobian
-from slipid.fitting.shared_effects import EffectPosterior, marginal_residuals, marginal_slopes
-from slipid.fitting.variances import MOTION_BLOCKS
+from slipid.fitting.problem import Problem
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.result import Channels, Fit, draws
 from slipid.predict.predictive import force_balance_of
@@ -83,39 +79,10 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
     The stds are those of the Laplace covariance, as in the stopping rule of the rounds. Stds from
     the solver's own Jacobian would be too small for friction, since the solver holds the contact
     forces fixed.
-
-    The step is delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), with r the residuals,
-    J their Jacobian, W the weighted inverse noise covariance, S the prior stds, and g the gradient
-    of log |d residuals / d data|. Currents and voltages change the electric parameters only.
     """
-    state, every = optimum.state, problem.full_weight
-    z, log_v = state.z, state.log_variance
-    electric = problem.electric(z, log_v)
-    residual, jacobian = problem.linear(z, electric)
-    weighed = problem.weighed(residual, log_v, every, state.shared(len(problem.windows)))
-    roots = weighed.whitening.root
-    own = problem.space.electric.astype(float)
-    prior = np.asarray(problem.objective.prior_std(log_v)) ** -2
-    _, slope = log_jacobian(problem.objective, z, electric, every)
-    gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
-    info = np.diag(prior)
-    for k, root in roots.items():
-        white = jnp.einsum("nij,nj->ni", root, residual[k])
-        half = jnp.einsum("nij,njp->nip", root, jacobian[k])
-        if k == "motion":
-            white, half = _without_effects(weighed.effects, white, half)
-        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTION_BLOCKS else own)
-        gradient = gradient + flat.T @ np.asarray(white).ravel()
-        info = info + flat.T @ flat
-    std = np.sqrt(np.diag(optimum.covariance))
-    steps = np.abs(np.linalg.solve(info, gradient)) / std
+    state = optimum.state
+    linear = problem.linear(state.z, problem.electric(state.z, state.log_variance))
+    found = newton_step(problem, state, linear, problem.full_weight)
+    steps = np.abs(found.step) / np.sqrt(np.diag(optimum.covariance))
     worst = int(np.argmax(steps))
     return float(steps[worst]), problem.space.names[worst]
-
-
-@jax.jit
-def _without_effects(
-    effects: tuple[EffectPosterior, ...], white: Array, half: Array
-) -> tuple[Array, Array]:
-    """Return whitened residuals and their derivative with the shared effects marginalised."""
-    return marginal_residuals(effects, white), marginal_slopes(effects, half)

@@ -1,7 +1,8 @@
 """Open-loop prediction of runs by a fit and by every other slip model, and their scores."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "slipid.validation/1"
+SAME_LAG_S = 0.005
+"""Largest difference of two lags for which windows cut for one lag serve for the other [s]."""
 
 
 @dataclass(frozen=True)
@@ -126,25 +129,48 @@ class Validation:
 
 
 def validation(
-    fit: ForceBalance, models: Sequence[FloorModels], data: Runs, new: int = 0
+    fit: ForceBalance,
+    models: Sequence[FloorModels],
+    data: Runs,
+    new: int = 0,
+    seen: Robot | None = None,
+    chosen: Mapping[str, str] = MappingProxyType({}),
 ) -> Validation:
     """Return the scores of runs on known floors, predicted by a fit and by every slip model.
 
     As in `folds`, every run is predicted as if it were the only run of its session: the session
     effect is unknown and widens the region by its fitted variance, even if other runs of the
-    session were fitted. A run begins at its first pose after the wheels have moved by 10 mm. `new`
-    is the number of runs that were not fitted.
+    session were fitted. A run begins at its first pose after the wheels have moved by 10 mm.
+
+    Args:
+        fit: the force balance.
+        models: other slip models, fitted floor by floor.
+        data: runs on known floors.
+        new: number of the runs that were not fitted.
+        seen: robot with the pose sensor by which the other models are judged, None for the robot
+            of the force balance.
+        chosen: name of the selected model, keyed by floor; its scores are repeated as those of the
+            model `selected`.
 
     Raises:
         DataError: the floor or the load set-up of a run was not identified.
     """
     _known(fit.robot, data)
     runs: dict[int, ScoredRun] = {}
-    for w in replay.replay_windows(data, fit.robot):
+    own = fit.robot if seen is None else seen
+    cuts = replay.replay_windows(data, fit.robot)
+    for w in cuts:
         add_scores(runs, data, fit.name, *fit.ends(w))
+    if abs(float(own.camera.lag - fit.robot.camera.lag)) > SAME_LAG_S:
+        cuts = replay.replay_windows(data, own)
+    for w in cuts:
+        late = w.at_lag(float(own.camera.lag))
         for model in models:
-            tracks = replay.tracks_from_increments(fit.robot, w, model.increments(w, fit.robot))
+            tracks = replay.tracks_from_increments(own, w, model.increments(late, own))
             add_scores(runs, data, model.name, tracks, None)
+    for run in runs.values():
+        if name := chosen.get(run.surface):
+            run.models["selected"] = run.models[fit.name if name == "contact" else name]
     return Validation(tuple(runs[k] for k in range(len(data))), new)
 
 

@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
+from slipid.fitting.calibration import Calibration
 from slipid.report.page import Page, percent, table, verdict
 from slipid.support.content import Content
 
 if TYPE_CHECKING:
+    from slipid.fitting.calibration import Value
     from slipid.infer.bench.verdict import BenchFit
     from slipid.infer.posterior.diagnosis import Posterior
     from slipid.infer.result import Fit
-    from slipid.infer.verdicts.disputed import Trust
     from slipid.infer.verdicts.estimates import Estimate
     from slipid.infer.verdicts.profile import Profile
+    from slipid.infer.verdicts.trust import Trust
 
 RECOVERED = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
 """Colours of a self test's verdicts on how a parameter was recovered."""
@@ -84,6 +86,8 @@ def show_posterior(page: Page, found: "Posterior") -> None:
 
 def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None:
     """Write the parameters of a fit, their profiles, its warnings and how it ended."""
+    if fit.calibration is not None:
+        show_calibration(page, fit.calibration)
     page.table(estimates(fit.parameters.values(), f"{len(fit.runs)} runs, {fit.rounds} rounds"))
     if fit.derived:
         page.table(estimates(fit.derived.values(), OPEN_RATIOS))
@@ -93,14 +97,54 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
+def show_calibration(page: Page, found: Calibration) -> None:
+    """Write calibrated lengths, floor by floor, and the place of the pose sensor."""
+    page.table(calibration_table(found))
+    for floor, (radius, base) in found.multipliers.items():
+        each = " ".join(f"{r:.4f}" for r in radius)
+        page.line(
+            f"multipliers of the config's lengths on {floor}: radius {each}, track {base:.4f}"
+        )
+
+
+def calibration_table(found: Calibration) -> Table:
+    """Return a table of calibrated numbers."""
+    columns = ("calibration", "value", "unit", "90 % interval", "verdict")
+    made = table(columns, right=("value",))
+
+    def row(name: str, value: "Value") -> None:
+        factor, unit = (1e3, "mm") if value.unit == "m" else (1.0, value.unit)
+        low, high = (factor * end for end in value.interval90)
+        ends = "" if value.verdict == "fixed" else f"{low:.5g} .. {high:.5g}"
+        made.add_row(Text(name), f"{factor * value.value:.5g}", unit, ends, verdict(value.verdict))
+
+    for floor, radii in found.radius.items():
+        sides = ("left", "right") if len(radii) == 2 else range(1, len(radii) + 1)
+        for side, value in zip(sides, radii, strict=True):
+            row(f"{floor}: rolling radius {side}", value)
+        row(f"{floor}: effective {'base' if found.sideways else 'track'}", found.base[floor])
+        if floor in found.centre:
+            row(f"{floor}: centre of rotation ahead", found.centre[floor])
+    row("pose sensor ahead", found.offset[0])
+    row("pose sensor to the left", found.offset[1])
+    row("pose sensor yaw", found.yaw)
+    row("pose lag", found.lag)
+    if found.scale.verdict != "fixed":
+        row("true over logged length", found.scale)
+    return made
+
+
 def show_trust(page: Page, found: "Trust") -> None:
-    """Write the open-loop errors of the fit on its runs, and the verdict on whether to trust it."""
+    """Write the errors of slip models on held-out runs, the selected ones, and the verdict."""
+    models = list(next(iter(found.floors.values())).errors) if found.floors else []
+    made = table(("surface", *models, "selected", "runs"))
+    for name, floor in found.floors.items():
+        each = (percent(floor.errors[m]) for m in models)
+        made.add_row(Text(name), *each, floor.model, str(floor.runs))
     if found.floors:
-        made = table(("surface", "end / path", "encoders alone"))
-        for name, e in found.floors.items():
-            made.add_row(name, percent(e.model), percent(e.encoders))
-        page.line(f"open loop from the first pose on, {found.runs} of the fitted runs:")
+        page.line("held-out runs, open loop from the first pose: error over the path length")
         page.table(made)
+    page.notes(found.notes)
     page.line(f"verdict: {found}")
 
 
@@ -143,6 +187,9 @@ def show_check(page: Page, found: Content) -> None:
         page.line(_clocks(found["clocks"]))
     for note, count in found["notes"].items():
         page.line(f"repaired in {count} runs: {note}")
+    if "calibration" in found:
+        show_calibration(page, Calibration.of_json(found["calibration"]))
+    page.notes(found["suspects"])
     page.line(
         "before a fit: what a fit may find, from the least to the most informative of plausible "
         "floors, motors and noise; only the fit itself can find at bound or disputed"

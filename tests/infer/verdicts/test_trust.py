@@ -2,8 +2,9 @@
 
 import pytest
 
-from slipid.infer.verdicts.disputed import EndPoints, verdict_of_trust
 from slipid.infer.verdicts.estimates import Estimate
+from slipid.infer.verdicts.trust import verdict_of_trust
+from slipid.predict.selection import FloorSelection
 
 
 def number(path="motor.resistance", value=5.95, verdict="identified"):
@@ -24,7 +25,12 @@ def number(path="motor.resistance", value=5.95, verdict="identified"):
     )
 
 
-GOOD = {"gray": EndPoints(model=0.02, encoders=0.4)}
+def floor(model="contact", held_out=True, **errors):
+    order = {name: errors[name] for name in ("nominal", "calibrated", "contact") if name in errors}
+    return FloorSelection(model, order, {}, 6, held_out)
+
+
+GOOD = {"gray": floor(nominal=0.4, calibrated=0.1, contact=0.02)}
 
 
 def test_a_fit_that_predicts_and_settled_is_trusted():
@@ -37,20 +43,26 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
     [
         (GOOD, False, [number()], "doubtful", "did not converge"),
         (
-            {"ice": EndPoints(0.24, 0.2)},
-            True,
-            [number()],
-            "doubtful",
-            "off by 24.0 %",
-        ),
-        ({"ice": EndPoints(0.8, 0.3)}, True, [number()], "not to be trusted", "80.0 % of the path"),
-        ({"ice": EndPoints(0.6, 0.9)}, True, [number()], "doubtful", "neither is useful"),
-        (
-            {"a": EndPoints(float("nan"), 0.1)},
+            {"ice": floor(nominal=0.02, calibrated=0.05, contact=0.03)},
             True,
             [number()],
             "not to be trusted",
-            "not finite",
+            "off by 3.00 % of the path, and the simpler nominal by 2.00 %",
+        ),
+        (
+            {"ice": floor(model="calibrated", nominal=0.9, calibrated=0.6)},
+            True,
+            [],
+            "doubtful",
+            "no model predicts runs to 50 %",
+        ),
+        ({"a": floor(contact=float("nan"))}, True, [number()], "not to be trusted", "not finite"),
+        (
+            {"a": floor(held_out=False, nominal=0.1, contact=0.01)},
+            True,
+            [number()],
+            "doubtful",
+            "only one run",
         ),
         (GOOD, True, [number(value=4e4)], "not to be trusted", "motor.resistance = 4e+04 ohm"),
         (GOOD, True, [number(verdict="at_bound")], "doubtful", "is at its bound"),
@@ -66,10 +78,18 @@ def test_every_reason_against_it_is_reported(floors, converged, numbers, word, r
 
 
 def test_errors_that_are_both_tiny_are_no_reason():
-    assert verdict_of_trust({"a": EndPoints(0.006, 0.003)}, True, [number()]).word == "trusted"
+    floors = {"a": floor(nominal=0.003, contact=0.0039)}
+    assert verdict_of_trust(floors, True, [number()]).word == "trusted"
 
 
 def test_the_worst_reason_comes_first():
-    found = verdict_of_trust({"ice": EndPoints(0.8, 0.3)}, False, [number()])
+    found = verdict_of_trust({"ice": floor(nominal=0.02, contact=0.03)}, False, [number()])
     assert "ice" in found.reasons[0]
     assert "converge" in found.reasons[1]
+
+
+def test_a_force_balance_that_is_not_selected_does_not_lower_the_trust():
+    floors = {"a": floor(model="calibrated", nominal=0.1, calibrated=0.01, contact=0.02)}
+    found = verdict_of_trust(floors, False, 3 * [number("a", 1.0, "at_bound")])
+    assert found.word == "trusted"
+    assert any("did not converge" in note for note in found.notes)
