@@ -846,8 +846,9 @@ def _changes(fit: _Fit) -> Float[np.ndarray, "part free"]:
     parts = max(1, int(np.ceil(LEAST_CLUSTERS / runs)))
     out = []
     for n in range(runs):
-        used = max(int(np.isfinite(fit.tracks.pose[n, 1:]).any(axis=1).sum()), 1)
-        part = np.repeat(np.minimum(np.arange(r.shape[1] // 3) * parts // used, parts - 1), 3)
+        posed = np.isfinite(fit.tracks.pose[n, 1:]).any(axis=1)
+        at = (np.cumsum(posed) - 1).clip(0)
+        part = np.repeat(at * parts // max(int(posed.sum()), 1), 3)
         for k in range(parts):
             mine = slope[n][part == k]
             out.append(np.linalg.solve(a - mine.T @ mine, mine.T @ r[n][part == k]))
