@@ -2,10 +2,10 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from slipid.support.progress import Reporter
 NEAR_OPTIMUM = 3
 """Round number given to a start near the optimum, so that the fit does not repeat its first rounds,
 which take more steps."""
+AnyTask = TypeVar("AnyTask", bound=FitTask)
 CHECKPOINT = "checkpoint"
 """Name, without suffix, of the file with the state of an unfinished fit."""
 
@@ -96,21 +97,20 @@ def identify(
     report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")
     _check_sanity(task, report, anyway)
     task = with_mixed(task, data, report)
-    kinematic = calibrated(task, report)
-    task = task.started_from(kinematic.calibration)
-    problem = task.problem()
-    for path in profiles:
-        try:
-            profiled(problem.space, path)
-        except ValueError as error:
-            raise DataError(f"--profile: {error}") from error
-    writable(out)
-    if sentence := _replaced_fit(out, task):
-        report.line(sentence)
-    key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
-    kept = Checkpoint(out, key)
-    problem, optimum = optimised(task, problem, kept, report)
-    fit = summarised(task, problem, optimum, report, kinematic)
+
+    def begin(problem: Problem) -> Checkpoint:
+        for path in profiles:
+            try:
+                profiled(problem.space, path)
+            except ValueError as error:
+                raise DataError(f"--profile: {error}") from error
+        writable(out)
+        if sentence := _replaced_fit(out, task):
+            report.line(sentence)
+        names = problem.space.names, problem.noise.names
+        return Checkpoint(out, key_of(config.hash, task.data_hash, *names))
+
+    fit, problem, optimum = fitted(task, report, begin)
     report.stage("writing")
     written = (*save(fit, out), "run.json", "config.toml")
     _write_run(task, fit.trust, data, out, time.monotonic() - began)
@@ -128,7 +128,7 @@ def identify(
         each = {p.path: asdict(p) for p in result}
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written = (*written, "profile.json")
-    kept.remove(f"{CHECKPOINT}.npz")
+    (out / f"{CHECKPOINT}.npz").unlink(missing_ok=True)
     return IdentifyResult(fit, task, tuple(result), written)
 
 
@@ -171,6 +171,27 @@ def _write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds
     inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}
     verdict = {"trust": trust.to_json(), "seed": task.settings.seed}
     write_run_file(out, config, inputs, seconds, verdict)
+
+
+def fitted(
+    task: FitTask,
+    report: Reporter,
+    begin: Callable[[Problem], Checkpoint | None] = lambda _: None,
+) -> tuple[Fit, Problem, Optimum]:
+    """Return the fit of a task, and its problem and optimum without runs over several floors.
+
+    The kinematics are calibrated first, and the force balance is fitted from there.
+
+    Args:
+        task: the fit task.
+        report: reporter of the progress.
+        begin: called with the problem before it is optimised; it returns the checkpoint from which
+            the fit continues, and in which every round is saved, or None.
+    """
+    task, kinematic = started(task, report)
+    problem = task.problem()
+    problem, optimum = optimised(task, problem, begin(problem), report)
+    return summarised(task, problem, optimum, report, kinematic), problem, optimum
 
 
 def optimised(
@@ -262,14 +283,14 @@ class KinematicFit:
     errors: Errors
 
 
-def calibrated(task: FitTask, report: Reporter) -> KinematicFit:
-    """Return the calibrated kinematics of a task, and report their numbers."""
+def started(task: AnyTask, report: Reporter) -> tuple[AnyTask, KinematicFit]:
+    """Return the task, starting from its calibrated kinematics, and these; report their numbers."""
     report.stage("calibrated kinematics")
     space = Space(task.robot, task.choices)
     found = KinematicFit(*kinematic_errors(task.dataset, space, task.choices))
     for sentence in found.calibration.sentences:
         report.line(sentence)
-    return found
+    return task.started_from(found.calibration), found
 
 
 def summarised(

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from slipid.app.config import read_config
-from slipid.app.identify import optimised, summarised
+from slipid.app.identify import fitted
 from slipid.app.problem import ConfigFitTask, fit_task, read_fit_task
 from slipid.data.runs import Runs
 from slipid.predict.validation import Validation
@@ -19,8 +19,7 @@ def held_back(
         read = read_config(config)
         whole: ConfigFitTask = read_fit_task(read, folder, report)
         job = fit_task(read, part(whole.dataset, fitted), (), report)
-        problem, optimum = optimised(job, job.problem(), None, report)
-        fit = summarised(job, problem, optimum, report)
+        fit, _, _ = fitted(job, report)
     assert fit.converged, fit.reason
     other = part(whole.dataset, judged)
     # a session that was not fitted has the marker where the robot has it
