@@ -5,17 +5,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from slipid.app.bench_priors import COPY_NAME
+from slipid.app.calibrate import KinematicFit, calibrated, write_run
 from slipid.app.check import sanity
 from slipid.app.config import read_config
-from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.data.check.findings import wrong
-from slipid.fitting.calibration import Calibration
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise
@@ -24,17 +22,13 @@ from slipid.infer.fit_file import save
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
-from slipid.infer.verdicts.trust import Trust
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.selection import (
-    Errors,
     calibrated_model,
     contact_errors,
-    kinematic_errors,
     selected,
 )
 from slipid.predict.slip_models import slip_models
-from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_json
@@ -44,7 +38,6 @@ from slipid.support.progress import Reporter
 NEAR_OPTIMUM = 3
 """Round number given to a start near the optimum, so that the fit does not repeat its first rounds,
 which take more steps."""
-AnyTask = TypeVar("AnyTask", bound=FitTask)
 CHECKPOINT = "checkpoint"
 """Name, without suffix, of the file with the state of an unfinished fit."""
 
@@ -91,12 +84,7 @@ def identify(
         DataError: config or logs are wrong; in this case nothing was written.
     """
     began = time.monotonic()
-    setup_jax(quiet=True)
-    config = read_config(config_path)
-    task = read_fit_task(config, data, report)
-    report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")
-    _check_sanity(task, report, anyway)
-    task = with_mixed(task, data, report)
+    task = with_mixed(checked_task(config_path, data, report, anyway), data, report)
 
     def begin(problem: Problem) -> Checkpoint:
         for path in profiles:
@@ -108,12 +96,12 @@ def identify(
         if sentence := _replaced_fit(out, task):
             report.line(sentence)
         names = problem.space.names, problem.noise.names
-        return Checkpoint(out, key_of(config.hash, task.data_hash, *names))
+        return Checkpoint(out, key_of(task.config.hash, task.data_hash, *names))
 
     fit, problem, optimum = fitted(task, report, begin)
     report.stage("writing")
     written = (*save(fit, out), "run.json", "config.toml")
-    _write_run(task, fit.trust, data, out, time.monotonic() - began)
+    write_run(task, fit.trust, data, out, time.monotonic() - began)
     if profiles and task.mixed:
         report.line("profiles use only the runs on one floor each")
 
@@ -130,6 +118,15 @@ def identify(
         written = (*written, "profile.json")
     (out / f"{CHECKPOINT}.npz").unlink(missing_ok=True)
     return IdentifyResult(fit, task, tuple(result), written)
+
+
+def checked_task(config_path: Path, data: Path, report: Reporter, anyway: bool) -> ConfigFitTask:
+    """Return the fit task of a config whose runs do not contradict it; arguments of `identify`."""
+    setup_jax(quiet=True)
+    task = read_fit_task(read_config(config_path), data, report)
+    report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")
+    _check_sanity(task, report, anyway)
+    return task
 
 
 def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
@@ -160,19 +157,6 @@ def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
             report.line(f"{finding.severity}: {finding}")
 
 
-def _write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:
-    """Write run.json, and copies of the config and the bench file, which later commands read."""
-    config = task.config
-    if (bench := config.content.wheels.motor) is not None:
-        write_json(
-            out / COPY_NAME, read_json(config.path.parent / bench, "the parameters of a motor")
-        )
-    logs = {log.name: log.sha256 for log in task.logs}
-    inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}
-    verdict = {"trust": trust.to_json(), "seed": task.settings.seed}
-    write_run_file(out, config, inputs, seconds, verdict)
-
-
 def fitted(
     task: FitTask,
     report: Reporter,
@@ -188,7 +172,8 @@ def fitted(
         begin: called with the problem before it is optimised; it returns the checkpoint from which
             the fit continues, and in which every round is saved, or None.
     """
-    task, kinematic = started(task, report)
+    kinematic = calibrated(task, report)
+    task = task.started_from(kinematic.calibration)
     problem = task.problem()
     problem, optimum = optimised(task, problem, begin(problem), report)
     return summarised(task, problem, optimum, report, kinematic), problem, optimum
@@ -270,29 +255,6 @@ def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | Non
     return start, history
 
 
-@dataclass(frozen=True, eq=False)
-class KinematicFit:
-    """Calibrated kinematics of a task.
-
-    Attributes:
-        calibration: calibration from all runs.
-        errors: errors of the kinematic models on held-out runs.
-    """
-
-    calibration: Calibration
-    errors: Errors
-
-
-def started(task: AnyTask, report: Reporter) -> tuple[AnyTask, KinematicFit]:
-    """Return the task, starting from its calibrated kinematics, and these; report their numbers."""
-    report.stage("calibrated kinematics")
-    space = Space(task.robot, task.choices)
-    found = KinematicFit(*kinematic_errors(task.dataset, space, task.choices))
-    for sentence in found.calibration.sentences:
-        report.line(sentence)
-    return task.started_from(found.calibration), found
-
-
 def summarised(
     task: FitTask, problem: Problem, optimum: Optimum, report: Reporter, kinematic: KinematicFit
 ) -> Fit:
@@ -371,11 +333,11 @@ def _mixed_sentence(about: Mapping[str, Any]) -> str:
 
 def _with_baselines(fit: Fit, task: FitTask) -> Fit:
     """Return the fit with simpler models, fitted to the same runs with the calibrated sensor."""
-    seen, shape = fit.seen, fit.space.template.geometry
+    seen, shape = fit.seen, fit.config_shape
     cut = task.windows(seen)
     learnt = [model.fit(cut, seen) for model in slip_models(shape, fit.channels.current)]
     if fit.calibration is not None:
-        own = calibrated_model(fit.calibration, fit.space.template)
+        own = calibrated_model(fit.calibration, shape)
         learnt = [own if model.name == own.name else model for model in learnt]
     plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}
     return replace(fit, baselines=plain)

@@ -313,6 +313,12 @@ def fit_task(
             f"{log.name}: no steering angle; expected the channel steering_angle in the layout of "
             "every log, since robot.drive is 'steered'"
         )
+    if shape.driven is None and dataset.steering is not None:
+        raise DataError(
+            f"{config.path}: robot.drive is '{config.content.wheels.drive}', which has no steered "
+            "wheel, but a layout has the channel steering_angle; remove this channel, or describe "
+            "the robot with drive = 'steered'"
+        )
     robot = robot_for_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out, by_user = _choices(config, robot)
     # A lag that the config sets is not replaced by the lag that the motion shows.

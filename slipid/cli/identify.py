@@ -27,13 +27,18 @@ def identify(
     anyway: Annotated[
         bool, flag("--anyway", "Fit even if logs and config contradict each other.")
     ] = False,
+    only: Annotated[
+        str | None,
+        option("PART", "Stop after a part: calibration (radii, track, place of the pose sensor)."),
+    ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Fit the parameters of motors, floors, loads and camera to logs.
+    """Calibrate a robot, fit its motors, floors and loads, and select the model of every floor.
 
     Writes identified.json, fit.json, robot.json and pictures. An interrupted fit is continued. The
-    exit code is 1 if the fit did not converge, or predicts runs worse than odometry from encoders.
+    exit code is 1 if the selected models are not to be trusted: on held-out runs, a simpler model
+    predicts better.
     """
     from slipid.app.config import BenchMotors, read_config
     from slipid.report.estimates import show_fit, show_trust
@@ -42,6 +47,10 @@ def identify(
     wanted = read_config(config)
     if isinstance(wanted.content.robot, BenchMotors):
         return bench(wanted, data, out, profile or (), json, quiet)
+    if only not in (None, "calibration"):
+        raise DataError(f"--only {only}: no such part; expected calibration")
+    if only:
+        return calibration(config, data, out, anyway, json, quiet)
     with Reporter(quiet=quiet) as report:
         done = run(config, data, out, report, profile or (), anyway)
     content = read_json(out / "identified.json", "a result of `slipid identify`")
@@ -51,7 +60,32 @@ def identify(
         show_trust(page, done.fit.trust)
 
     emit(json, content, show, out, done.written)
-    return 0 if done.fit.converged and not done.fit.trust.is_bad else 1
+    return 1 if done.fit.trust.is_bad else 0
+
+
+def calibration(
+    config: Path, data: Path, out: Path, anyway: bool, json: str | None, quiet: bool
+) -> int:
+    """Calibrate a robot's kinematics alone, write and print the result, return the exit code."""
+    from slipid.app.calibrate import calibrate_only
+    from slipid.app.identify import checked_task
+    from slipid.deploy.deploy import ROBOT, calibrated_robot
+    from slipid.report.estimates import show_calibration, show_trust
+    from slipid.support.files import read_json
+
+    with Reporter(quiet=quiet) as report:
+        task = checked_task(config, data, report, anyway)
+        done = calibrate_only(task, data, out, report)
+        models = {floor: one.model for floor, one in done.selection.items()}
+        calibrated_robot(done.calibration, task.robot, models, task.dataset).save(out / ROBOT)
+    content = read_json(out / "identified.json", "a result of `slipid identify`")
+
+    def show(page: "Page") -> None:
+        show_calibration(page, done.calibration)
+        show_trust(page, done.trust)
+
+    emit(json, content, show, out, (*done.written, ROBOT))
+    return 1 if done.trust.is_bad else 0
 
 
 def run(

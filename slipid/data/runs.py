@@ -101,14 +101,15 @@ class Runs:
     def turned(self, run: int) -> Float[np.ndarray, "row column"]:
         """Return the wheel angles [rad] of a run.
 
-        If the steering angle is logged, its integral over time [rad s] and the time [s] follow.
+        If the steering angle is logged, its integral over the mean of the wheel angles [rad^2] and
+        the time [s] follow.
         """
         rows = self.rows(run)
+        angle = self.wheel_angle[rows]
         if self.steering is None:
-            return self.wheel_angle[rows]
-        time = self.time[rows]
-        steered = integral(time, self.steering[rows, None])
-        return np.concatenate([self.wheel_angle[rows], steered, time[:, None]], axis=1)
+            return angle
+        steered = integral(angle.mean(axis=1), self.steering[rows, None])
+        return np.concatenate([angle, steered, self.time[rows, None]], axis=1)
 
     def subset(self, keep: Iterable[int] | np.ndarray) -> "Runs":
         """Return the runs with the given indices, in the given order."""

@@ -258,7 +258,7 @@ def _cut(
         noise: variance of a single reading of each ammeter [A^2].
     """
     rows = data.rows(run)
-    t, angle = data.time[rows], data.wheel_angle[rows]
+    t, angle = data.time[rows], data.turned(run)
     at = t[edges] - lag
     half = SPEED_S / 2
     turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))

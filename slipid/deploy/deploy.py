@@ -12,21 +12,37 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from slipid.data.runs import Runs
 from slipid.deploy.robot_record import effects_by_load, robot_record
+from slipid.fitting.calibration import Calibration
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.result import Fit, draws
 from slipid.infer.verdicts.estimates import Estimate
+from slipid.model.geometry import Geometry
+from slipid.model.kinematics import matrices, with_lengths
 from slipid.model.robot import Robot, Validity
 from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import MIXED_FLOORS_PENALTY
-from slipid.robot.record import LogSensors, Pair, RecordedNumber, RobotRecord, Source, plain
+from slipid.robot.record import (
+    Axes,
+    FloorRecord,
+    LoadRecord,
+    LogSensors,
+    Pair,
+    RecordedNumber,
+    RobotRecord,
+    Source,
+    axes_of,
+    plain,
+)
 from slipid.robot.robot_file import typed
 from slipid.robot.twin import ActuatorModel
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
+from slipid.support.files import hash_of
 
 ROBOT = "robot.json"
 NO_CONTROLLER = (
@@ -67,6 +83,9 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
     # a robot that was fitted to runs over several floors is expected to drive across edges, so use
     # the smaller penalty for several floors under it
     alike = record.alike if fit.mixed is None else MIXED_FLOORS_PENALTY
+    if fit.calibration is not None:
+        models = {floor: one.model for floor, one in fit.selection.items()}
+        record = with_kinematics(record, fit.calibration, fit.config_shape, models)
     return DeployedRobot.of(
         replace(
             record,
@@ -75,6 +94,95 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
             alike=alike,
             messages=found.messages,
             data=fit.data_hash,
+            versions=versions(),
+        )
+    )
+
+
+def with_kinematics(
+    record: RobotRecord, found: Calibration, shape: Geometry, models: Mapping[str, str]
+) -> RobotRecord:
+    """Return the record with calibrated kinematics on the floors where they were selected.
+
+    Args:
+        record: record of the force balance.
+        found: the calibration.
+        shape: geometry with the lengths of the config.
+        models: name of the selected slip model, keyed by floor; `nominal` stands for kinematics
+            with the lengths of the config.
+    """
+    rolling, one = np.asarray(shape.pseudo_inverse()), float(shape.wheel_radius)
+    floors, spread = list(record.floors), {}
+    for k, floor in enumerate(record.floors):
+        model = models.get(floor.name, "contact")
+        if model == "contact":
+            continue
+        numbers = found.numbers(floor.name) * (model == "calibrated")
+        *radius, base, centre = numbers
+        matrix = matrices(rolling, one * np.exp(radius), np.exp(base), np.asarray(centre))
+        rows = tuple(tuple(float(x) for x in row) for row in matrix)
+        effect = found.noise.effect[floor.name]
+        floors[k] = replace(
+            floor,
+            kinematics=(rows[0], rows[1], rows[2]),
+            process=found.noise.process[floor.name],
+            effect=effect,
+        )
+        # what uncertain lengths do per metre: a radius to the distance, radii and base to the yaw
+        std = max(v.std / v.value for v in found.radius[floor.name])
+        of_base = found.base[floor.name].std / found.base[floor.name].value
+        spread[k] = (std, 0.0, float(np.hypot(std, of_base)) / found.base[floor.name].value)
+    loads = tuple(_without_effects(load, floors, spread) for load in record.loads)
+    return replace(record, floors=tuple(floors), loads=loads)
+
+
+def _without_effects(
+    load: LoadRecord, floors: Sequence[FloorRecord], spread: Mapping[int, Axes]
+) -> LoadRecord:
+    """Return a load set-up in which floors with calibrated kinematics have no expected effects.
+
+    `spread` is the std of their motion per metre due to uncertain lengths, keyed by the floor's
+    index.
+    """
+    wide = tuple(spread.get(k, axes) for k, axes in enumerate(load.spread))
+    if load.told is None:
+        return replace(load, spread=wide)
+    mean, left = list(load.told.mean), list(load.told.left)
+    for k, axes in spread.items():
+        whole = axes_of(np.hypot(floors[k].effect, axes))
+        mean[k] = tuple(((0.0, 0.0, 0.0),) * len(row) for row in mean[k])
+        left[k] = tuple((whole,) * len(row) for row in left[k])
+    return replace(load, spread=wide, told=replace(load.told, mean=tuple(mean), left=tuple(left)))
+
+
+def calibrated_robot(
+    found: Calibration, robot: Robot, models: Mapping[str, str], data: Runs
+) -> DeployedRobot:
+    """Return the robot of a calibration alone, with a force balance at its start values.
+
+    The force balance is only used while the wheels are on several floors.
+
+    Args:
+        found: the calibration.
+        robot: robot with the lengths of the config, and the floors and loads of the runs.
+        models: name of the selected kinematic model, keyed by floor.
+        data: the calibrated runs.
+    """
+    shape = with_lengths(robot.geometry, found.nominal_radius, found.nominal_base)
+    speed = max(
+        float(np.abs(np.gradient(angle, log.time, axis=0)).max())
+        for log in data.logs
+        if len(angle := log.wheel_angle) > 2
+    )
+    draws = jax.tree.map(lambda leaf: np.stack([np.asarray(leaf)] * 2), robot)
+    record = robot_record(robot, given_numbers(robot), {}, draws, speed, (0.0, 0.0), {})
+    signed = data.current_is_signed and data.current is not None
+    return DeployedRobot.of(
+        replace(
+            with_kinematics(record, found, shape, models),
+            sensors=LogSensors(current_is_signed=signed, voltage=data.voltage is not None),
+            messages=("calibrated kinematics alone: no force balance was fitted",),
+            data=hash_of((log.name, log.sha256) for log in data.logs),
             versions=versions(),
         )
     )

@@ -51,8 +51,7 @@ from slipid.fitting.innovations import (
     sensor_yaw,
     start_headings,
 )
-from slipid.model.geometry import Geometry
-from slipid.model.kinematics import Kinematics, Steering, is_axle, nominal_base
+from slipid.model.kinematics import Kinematics, Steering, is_axle, nominal_base, nominal_steering
 from slipid.model.robot import Robot
 from slipid.parameter import as_numbers
 from slipid.search_space import Choice, Space
@@ -226,7 +225,8 @@ class Calibration:
     def numbers(self, floor: str) -> Float[np.ndarray, " number"]:
         """Return log radius ratios of the drives, log base ratio, and centre [m] on a floor.
 
-        Ratios are to the config's lengths.
+        Ratios are to the config's lengths. Zero [rad], gain and understeer [s^2/m] of the steering
+        follow if a wheel is steered.
 
         Raises:
             ValueError: the floor was not calibrated.
@@ -235,7 +235,9 @@ class Calibration:
             raise ValueError(f"no surface '{floor}'; calibrated: {', '.join(self.radius)}")
         radius = [np.log(v.value / self.nominal_radius) for v in self.radius[floor]]
         centre = self.centre[floor].value if floor in self.centre else 0.0
-        return np.array([*radius, np.log(self.base[floor].value / self.nominal_base), centre])
+        steering = [v.value for name, v in self.steering.items() if name != "wheelbase_m"]
+        base = np.log(self.base[floor].value / self.nominal_base)
+        return np.array([*radius, base, centre, *steering])
 
     def seen(self, robot: Robot) -> Robot:
         """Return a robot whose poses are measured by the calibrated pose sensor."""
@@ -508,14 +510,6 @@ def _floors_with_turns(space: Space, data: Runs) -> set[str]:
     return {f for f, x in turned.items() if max(x) > WHOLE_TURN or np.mean(x) > MEAN_TURN}
 
 
-def _nominal(shape: Geometry) -> tuple[Float[np.ndarray, "3 drive"], Steering | None]:
-    """Return the matrix from wheel turns to body increments, and the steering, by the config."""
-    matrix = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
-    if shape.driven is None:
-        return matrix, None
-    return matrix, Steering(nominal_base(shape), 0.0, 1.0, 0.0, float(shape.driven == "front"))
-
-
 def _is_fixed(choices: Sequence[Choice], path: str) -> bool:
     """Return whether the last choice about a parameter fixes it."""
     mine = [c for c in choices if fnmatchcase(path, c.pattern)]
@@ -781,9 +775,9 @@ def _in_stds(
 def _cut(fit: _Fit) -> _Fit:
     """Return the fit with the tracks cut at the present lag."""
     shape = fit.model.space.template.geometry
-    nominal, steering = _nominal(shape)
+    nominal = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
     arm, lag = 0.5 * nominal_base(shape), float(fit.model.column("lag", fit.z))
-    tracks = pose_tracks(fit.data, lag, nominal, arm, steering)
+    tracks = pose_tracks(fit.data, lag, nominal, arm, nominal_steering(shape))
     return replace(fit, tracks=tracks, weight=np.ones(len(tracks.pose)))
 
 

@@ -26,6 +26,8 @@ from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
+from slipid.model.geometry import Geometry
+from slipid.model.kinematics import with_lengths
 from slipid.model.robot import Robot, Validity
 from slipid.predict.predictive import ForceBalance
 from slipid.predict.ranking import Comparison, compared
@@ -195,9 +197,17 @@ class Fit:
         Raises:
             DataError: a run has a floor or a load set-up that was not identified.
         """
-        models = restored(self.space.template.geometry, dict(self.baselines))
+        models = restored(self.config_shape, dict(self.baselines))
         chosen = {floor: one.model for floor, one in self.selection.items()}
         return validation(self.contact, models, runs, self.new_runs(runs), self.seen, chosen)
+
+    @property
+    def config_shape(self) -> Geometry:
+        """Geometry with the lengths of the config, which the fit may have changed."""
+        shape: Geometry = self.space.template.geometry
+        if self.calibration is None:
+            return shape
+        return with_lengths(shape, self.calibration.nominal_radius, self.calibration.nominal_base)
 
     @property
     def seen(self) -> Robot:

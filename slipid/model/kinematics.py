@@ -26,13 +26,18 @@ Mandow et al. 2007, IROS; rolling omni wheels, Indiveri 2009, IEEE T-RO 25(1);
 steady turn with understeer, Gillespie 1992, Fundamentals of Vehicle Dynamics, chapter 6.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.model.geometry import Geometry
+from slipid.parameter import as_numbers
+
+LEAST_TURN, MOST = 1e-6, 1.3
+"""Wheel turn below which a step has no steering angle, and largest logged steering angle of a step
+[rad]."""
 
 
 class Steering(NamedTuple):
@@ -61,19 +66,23 @@ def rolled(
     Args:
         matrix: matrix from wheel turns [rad] to body increments, without the turning by steering.
         turn: wheel turns [rad]; those of a robot that steers are followed by the integral of the
-            steering angle over the step [rad s] and by the duration of the step [s].
+            steering angle over their mean [rad^2] and by the duration of the step [s].
         steering: numbers of a robot that steers, all without axes; else None.
     """
     if steering is None:
         return turn @ matrix.T
     xp = turn.__array_namespace__()
-    time = turn[..., -1]
-    seconds = xp.where(time > 0, time, 1.0)
-    angle = steering.gain * (turn[..., -2] / seconds - steering.zero)
-    ahead = (turn[..., :-2] @ matrix.T)[..., 0]
+    wheel, steered, time = turn[..., :-2], turn[..., -2], turn[..., -1]
+    mean = wheel.mean(axis=-1)
+    moves = abs(mean) > LEAST_TURN
+    # Without the limit, a wheel that turns to and fro in one step would steer at any angle.
+    logged = xp.clip(xp.where(moves, steered / xp.where(moves, mean, 1.0), 0.0), -MOST, MOST)
+    angle = steering.gain * (logged - steering.zero)
+    ahead = (wheel @ matrix.T)[..., 0]
     ahead = ahead * (1 - steering.front * (1 - xp.cos(angle)))
-    radius = steering.wheelbase + steering.understeer * (ahead / seconds) ** 2
-    return xp.stack([ahead, xp.zeros_like(ahead), ahead * xp.tan(angle) / radius], axis=-1)
+    speed = ahead / xp.where(time > 0, time, 1.0)
+    length = steering.wheelbase + steering.understeer * speed**2
+    return xp.stack([ahead, xp.zeros_like(ahead), ahead * xp.tan(angle) / length], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +148,25 @@ def nominal_base(shape: Geometry) -> float:
     return float(arm.mean()) * (1.0 if shape.determines_twist else 2.0)
 
 
+def with_lengths(shape: Geometry, radius: float, base: float) -> Geometry:
+    """Return a geometry with equal wheels of another radius, and another track or base [m]."""
+    ratio = base / nominal_base(shape)
+    return replace(
+        shape,
+        wheel_radius=as_numbers(radius),
+        base_radius=as_numbers(float(shape.base_radius) * ratio),
+        radius_deviation=as_numbers(np.zeros(shape.drives)),
+    )
+
+
 def is_axle(shape: Geometry) -> bool:
     """Return whether all ordinary wheels are on one axle, whose middle the robot turns about."""
     place = np.asarray(shape.place) * float(shape.base_radius)
     return all(shape.grips) and float(np.ptp(place[:, 0])) < 1e-3 * float(shape.base_radius)
+
+
+def nominal_steering(shape: Geometry) -> Steering | None:
+    """Return the steering that the config gives, or None if no wheel is steered."""
+    if shape.driven is None:
+        return None
+    return Steering(nominal_base(shape), 0.0, 1.0, 0.0, float(shape.driven == "front"))

@@ -61,7 +61,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.model.geometry import Geometry
-from slipid.model.kinematics import matrices
+from slipid.model.kinematics import Steering, matrices, rolled
 from slipid.predict.slip_model import Channel, RobotSpec, Twists, turned
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
@@ -155,8 +155,9 @@ class Calibrated(TwistModel):
     """Calibrated kinematics: effective radius of every drive, track or base, centre of rotation.
 
     The coefficients are those of `slipid.fitting.calibration.Calibration.numbers`: log radius
-    ratios of the drives, log base ratio, and centre [m]. `learn` estimates them for one floor from
-    windows of body poses, so that pose sensor and lag are taken as known.
+    ratios of the drives, log base ratio, centre [m], and numbers of the steering, if any. `learn`
+    estimates them for one floor from windows of body poses, so that pose sensor and lag are taken
+    as known; it estimates no steering.
 
     Attributes:
         shape: geometry to which the ratios refer, None for the robot's own.
@@ -190,11 +191,17 @@ class Calibrated(TwistModel):
 
     def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
         own = spec if self.shape is None else spec.of_shape(self.shape)
-        *radius, base, centre = self.known
+        numbers, steering = self.known, own.steering
+        if steering is not None:
+            numbers, (zero, gain, understeer) = numbers[:-3], numbers[-3:]
+            wheelbase = steering.wheelbase * np.exp(numbers[-2])
+            steering = Steering(wheelbase, zero, gain, understeer, steering.front)
+        *radius, base, centre = numbers
         matrix = matrices(
             own.back, own.wheel_radius * np.exp(radius), np.exp(base), np.asarray(centre)
         )
-        return np.asarray(steps.signals.speed @ matrix.T)
+        signals = steps.signals
+        return np.asarray(rolled(matrix, signals.turn, steering) / signals.dt[:, None])
 
 
 HARMONICS = 6

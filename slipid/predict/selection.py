@@ -30,6 +30,7 @@ from slipid.fitting.calibration import Calibration, cross_calibrated
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
+from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.folds import fold_keys, sectors
@@ -101,9 +102,9 @@ def selection_folds(data: Runs) -> Int[np.ndarray, " run"]:
     return fold
 
 
-def calibrated_model(calibration: Calibration, robot: Robot) -> FloorModels:
-    """Return calibrated kinematics as a slip model; `robot` has the lengths of the config."""
-    model = Calibrated(shape=robot.geometry)
+def calibrated_model(calibration: Calibration, shape: Geometry) -> FloorModels:
+    """Return calibrated kinematics as a slip model; `shape` has the lengths of the config."""
+    model = Calibrated(shape=shape)
     numbers = {floor: calibration.numbers(floor) for floor in calibration.radius}
     return FloorModels(model).with_state(numbers)
 
@@ -121,7 +122,7 @@ def kinematic_errors(
     plain = FloorModels(nominal(robot.geometry))
     for k, runs in _picked(data, fold).items():
         calibration = without.get(k, whole)
-        models = {"nominal": plain, "calibrated": calibrated_model(calibration, robot)}
+        models = {"nominal": plain, "calibrated": calibrated_model(calibration, robot.geometry)}
         _add_errors(errors, models, calibration.seen(robot), data, runs)
     return whole, errors
 

@@ -17,6 +17,7 @@ from slipid.data.wheel_signals import body_steps
 from slipid.data.windows import Windows
 from slipid.fitting.likelihood import indices, marker_increments, measured_increments
 from slipid.model.geometry import Geometry
+from slipid.model.kinematics import Steering, nominal_steering, rolled
 from slipid.model.robot import Robot
 
 Increments = Float[np.ndarray, "segment window 3"]
@@ -97,6 +98,7 @@ class RobotSpec:
         mass: mass of the robot [kg].
         determines_twist: True if the drives determine the body's twist; those of a skid steer do
             not.
+        steering: steering of the config if a wheel is steered; else None.
     """
 
     forward: Float[np.ndarray, "drive 3"]
@@ -108,6 +110,7 @@ class RobotSpec:
     back_emf: float
     mass: float
     determines_twist: bool
+    steering: Steering | None = None
 
     @classmethod
     def of(cls, robot: Robot) -> "RobotSpec":
@@ -124,6 +127,7 @@ class RobotSpec:
             back_emf=float(motor.back_emf),
             mass=float(robot.body.mass),
             determines_twist=bool(shape.determines_twist),
+            steering=nominal_steering(shape),
         )
 
     def of_shape(self, shape: Geometry) -> "RobotSpec":
@@ -144,7 +148,8 @@ class RunSignals:
     Attributes:
         name: name of the run.
         dt: length of each step [s].
-        turn: rotation of each drive's wheels in the step [rad].
+        turn: rotation of each drive's wheels in the step [rad]; a robot that steers has two more
+            columns, see `slipid.model.kinematics.rolled`.
         current: mean current of each motor [A], signed along its wheel's forward direction if
             `current_is_signed`, else its magnitude; None if it was not logged.
         gyro: mean yaw rate from the gyro [rad/s], or None.
@@ -173,7 +178,8 @@ class RunSignals:
 
     def rolling(self, spec: RobotSpec) -> Twists:
         """Return the body twist without slip, from the encoders only."""
-        return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
+        matrix = spec.wheel_radius * spec.back
+        return np.asarray(rolled(matrix, self.turn, spec.steering) / self.dt[:, None])
 
     def along(self, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
         """Return the current along the wheel's motion [A]: positive if the motor drives the wheel.

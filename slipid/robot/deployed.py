@@ -73,7 +73,10 @@ class RobotArrays(Drives):
             fitted over all floors.
         drive_of: drive of each wheel, see `slipid.model.geometry.Drives`.
         around: order of the wheels around the body, see `slipid.model.geometry.Geometry`.
+        kinematics: matrix from wheel speeds to the body twist on each floor, zero where the force
+            balance is used [m/rad, m/rad, 1].
         unseen: for each floor, True if no run drove on it.
+        calibrated: for each floor, True if `kinematics` is used while all wheels are on it.
     """
 
     frame: WheelFrame
@@ -92,9 +95,11 @@ class RobotArrays(Drives):
     current_trend: Float[Array, "2"]
     highest: Float[Array, "2"]
     wheel_curve: Float[Array, "drive 2"]
+    kinematics: Float[Array, "floor 3 drive"]
     drive_of: tuple[int, ...] = eqx.field(static=True)
     around: tuple[int, ...] = eqx.field(static=True)
     unseen: tuple[bool, ...] = eqx.field(static=True)
+    calibrated: tuple[bool, ...] = eqx.field(static=True)
 
     @property
     def arrays(self) -> "RobotArrays":
@@ -288,9 +293,13 @@ def _arrays(
         current_trend=as_numbers(record.current_trend),
         highest=as_numbers([record.highest_speed, chosen.highest_current]),
         wheel_curve=as_numbers(chosen.wheel_curve),
+        kinematics=as_numbers(
+            [floor.kinematics or np.zeros((3, geometry.drives)) for floor in floors]
+        ),
         drive_of=wheels.drive_of,
         around=geometry.around,
         unseen=tuple(floor.unseen for floor in floors),
+        calibrated=tuple(floor.kinematics is not None for floor in floors),
         record=record,
         load_setup=chosen.name,
     )

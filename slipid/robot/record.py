@@ -30,6 +30,7 @@ UNITS = {
     "wheels.gear_ratio": "1",
     "floors.process": "m/sqrt(m), m/sqrt(m), rad/sqrt(m)",
     "floors.effect": "m/m, m/m, rad/m",
+    "floors.kinematics": "m/rad, m/rad, rad/rad",
     "floors.current_std": "A",
     "floors.seen.wheel_speed": "rad/s",
     "floors.seen.torque_nm": "N*m",
@@ -113,6 +114,9 @@ class FloorRecord:
         seen: ranges of speed, torque and so on that the fitted runs cover; None if the parameters
             were given, not fitted.
         unseen: True for a floor that no run drove on, see `slipid.robot.deployed.with_unseen`.
+        kinematics: rows of the matrix from the drives' wheel speeds to the body twist, where
+            calibrated kinematics were selected for all wheels on this floor; None where the force
+            balance is used.
     """
 
     name: str
@@ -121,6 +125,7 @@ class FloorRecord:
     current_std: float
     seen: Validity | None
     unseen: bool = False
+    kinematics: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] | None = None
 
 
 @dataclass(frozen=True)

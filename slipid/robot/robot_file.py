@@ -110,7 +110,7 @@ def _wrong(where: str, value: object, expected: str) -> ValueError:
     return ValueError(f"{where}: {shown}; expected {expected}")
 
 
-SCHEMA = "slipid.robot/6"
+SCHEMA = "slipid.robot/7"
 REWRITE_HINT = "copy it again, or write it again with `slipid identify`"
 
 
@@ -217,6 +217,9 @@ def check_record(record: RobotRecord) -> None:
             raise ValueError(
                 f"{kind} {list(names)}; expected at least one name, and each name only once"
             )
+    for floor in record.floors:
+        for row in floor.kinematics or ():
+            _counted(f"floors, {floor.name}: kinematics", row, drives)
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
         _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, drives)

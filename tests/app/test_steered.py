@@ -9,6 +9,10 @@ import pytest
 
 from slipid.app.config import parsed, read_config
 from slipid.app.problem import read_fit_task
+from slipid.parameter import as_numbers
+from slipid.predict.kinematics import Calibrated, nominal
+from slipid.predict.open_loop import replay_windows, tracks_from_increments
+from slipid.predict.slip_models import FloorModels
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import write
@@ -84,6 +88,12 @@ def test_a_slow_steering_angle_is_linear_between_its_readings(car, tmp_path):
         ("encoders = 2", "encoders = 1", "1 wheels, but .* robot.encoders is the number on the"),
         ("encoders = 2", "encoders = 3", "encoders"),
         ("encoders = 2", "drives = [[1, 2]]", "drives is given; expected encoders"),
+        (
+            'drive = "steered"\nwheel_radius_m = 0.0325\nwheelbase_m = 0.324\ndriven = "rear"\n'
+            "encoders = 2",
+            'drive = "differential"\nwheel_radius_m = 0.0325\ntrack_m = 0.3',
+            "'differential', which has no steered wheel, but",
+        ),
         (STEERING, STEERING.replace("}", ", scale = 57.3 }"), "steering of .* rad"),
     ],
 )
@@ -112,6 +122,31 @@ def test_check_compares_wheels_and_steering_with_the_poses(car, tmp_path, old, n
     assert {one["kind"] for one in found if one["severity"] != "note"} == kinds, found
     assert says in " ".join(f"{one['found']} {one['remedy']}" for one in found)
     assert done.exit_code == (1 if kinds else 0)
+
+
+def path_errors(task, model: FloorModels, lag: float) -> np.ndarray:
+    """Return the end-point error over the path of every run, with the true pose sensor."""
+    camera = task.robot.camera
+    place = as_numbers(list(CAR.place))
+    robot = replace(task.robot, camera=replace(camera, lag=as_numbers(lag), marker_place=place))
+    (w,) = replay_windows(task.dataset, robot)
+    tracks = tracks_from_increments(robot, w, model.increments(w, robot))
+    far = np.linalg.norm(np.diff(tracks.measured[..., :2], axis=1), axis=2).sum(axis=1)
+    return np.linalg.norm(tracks.gap[:, :2], axis=1) / far
+
+
+def test_steered_kinematics_predict_windows(car):
+    """The true numbers predict paths to .5 % of their length, those of the config do not."""
+    task, floor = read(car / "robot.toml", car / "logs"), CAR.floors[0]
+    shape = task.robot.geometry
+    radii = np.log(np.array(floor.radius) / CAR.nominal_radius)
+    base = np.log(floor.base / CAR.nominal_base)
+    numbers = [*radii, base, 0.0, CAR.steering_zero, CAR.steering_gain, floor.understeer]
+    calibrated = FloorModels(Calibrated(shape=shape)).with_state({floor.name: np.array(numbers)})
+    assert path_errors(task, calibrated, CAR.lag).max() < 0.005
+    assert path_errors(task, FloorModels(nominal(shape)), CAR.lag).min() > 0.02
+    late = path_errors(task, calibrated, CAR.lag + 0.2)  # wheels and steering of another time
+    assert late.mean() > 2 * path_errors(task, calibrated, CAR.lag).mean()
 
 
 def test_what_needs_a_force_balance_says_that_there_is_none(car, tmp_path):

@@ -33,7 +33,8 @@ def test_others_carry_no_warning(word):
 
 def in_files(out):
     """Trust in the two files that identify writes it to."""
-    return tuple(json.loads((out / f).read_text())["trust"] for f in ("run.json", "identified.json"))
+    texts = (out / "run.json").read_text(), (out / "identified.json").read_text()
+    return tuple(json.loads(text)["trust"] for text in texts)
 
 
 @pytest.mark.slow
@@ -46,7 +47,8 @@ def test_the_selected_model_is_no_worse_than_simpler_ones_and_every_output_says_
     assert "verdict: trusted" in said.stdout
     chosen = json.loads((folder / "out" / "identified.json").read_text())["selected_model"]
     for floor, errors in found["held_out_error_over_path"].items():
-        assert found["held_out"][floor] and found["runs"][floor] > 0
+        assert found["held_out"][floor]
+        assert found["runs"][floor] > 0
         assert 0 < errors[chosen[floor]] < errors["nominal"]
         for error in errors.values():
             assert f"{100 * error:.2f}" in said.stdout

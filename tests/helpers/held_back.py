@@ -12,13 +12,13 @@ from slipid.support.progress import Reporter
 
 
 def held_back(
-    config: Path, folder: Path, fitted: tuple[str, ...], judged: tuple[str, ...]
+    config: Path, folder: Path, learnt: tuple[str, ...], judged: tuple[str, ...]
 ) -> Validation:
     """Fitted to runs that have one of some words in their names, judged on those with others."""
     with Reporter(quiet=True) as report:
         read = read_config(config)
         whole: ConfigFitTask = read_fit_task(read, folder, report)
-        job = fit_task(read, part(whole.dataset, fitted), (), report)
+        job = fit_task(read, part(whole.dataset, learnt), (), report)
         fit, _, _ = fitted(job, report)
     assert fit.converged, fit.reason
     other = part(whole.dataset, judged)

@@ -16,7 +16,7 @@ def moved(driven: str, angle: float, turn: list[float], **more: float) -> np.nda
     matrix = RADIUS * np.asarray(shape.pseudo_inverse())
     front = float(driven == "front")
     numbers = {"zero": 0.0, "gain": 1.0, "understeer": 0.0, "front": front} | more
-    columns = np.array([*turn, angle * SECONDS, SECONDS])
+    columns = np.array([*turn, angle * np.mean(turn), SECONDS])
     return rolled(matrix, columns, Steering(nominal_base(shape), **numbers))
 
 
@@ -44,6 +44,13 @@ def test_steps_without_duration_do_not_move():
     nothing = Steering(WHEELBASE, 0.1, 1.0, 0.02, 0.0)
     matrix = np.array([[RADIUS], [0.0], [0.0]])
     np.testing.assert_array_equal(rolled(matrix, np.zeros((2, 3)), nothing), np.zeros((2, 3)))
+
+
+def test_wheels_that_turn_to_and_fro_in_a_step_do_not_steer_at_any_angle():
+    numbers = Steering(WHEELBASE, 0.0, 1.0, 0.0, 0.0)
+    matrix = np.array([[RADIUS], [0.0], [0.0]])
+    _, _, yaw = rolled(matrix, np.array([1e-3, 0.5 * np.pi * 1e-3, SECONDS]), numbers)
+    assert abs(yaw) < 1e-3
 
 
 def test_numpy_and_jax_agree():

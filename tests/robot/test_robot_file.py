@@ -229,9 +229,9 @@ def test_what_is_no_robot_is_refused(tmp_path):
 
 
 def test_a_newer_file_asks_for_an_update(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/7", more=3))
+    rewritten(path, lambda c: c.update(schema="slipid.robot/8", more=3))
     said = refused(path)
-    assert "written by a newer slipid as slipid.robot/7" in said
+    assert "written by a newer slipid as slipid.robot/8" in said
     assert "update slipid" in said
 
 
@@ -334,7 +334,7 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c["draws"].update(mass=[1]), "'mass' is not a parameter"),
         (
             lambda c: c["units"].update(alike="m"),
-            "the units in this file differ from the units of slipid.robot/6",
+            "the units in this file differ from the units of slipid.robot/7",
         ),
         (lambda c: c["gains"]["values"].pop("yaw"), "gains.values.yaw is missing"),
         (

@@ -4,7 +4,8 @@ All wheels move the same body, so every hypothesis assigns a floor to each wheel
 further hypothesis is "unknown". In every step, after wheels may have changed floors:
 
     xi_c, I_c     body twist by contact equilibrium, and motor currents, of hypothesis c at the
-                  wheel speeds; xi_c includes the floor's mean effect if all wheels are on one floor
+                  wheel speeds; with all wheels on one floor xi_c includes the mean effect there,
+                  or follows from calibrated kinematics, if these were selected for the floor
     p_c <- p_c * (p(I | I_c) p(gyro | xi_c))^(dt / tau)   probability of c
     g_c <- g_c * exp(xi_c dt)                             pose if c is true
     g = sum_c p_c g_c                                     mean pose
@@ -165,6 +166,9 @@ class FloorFilter(eqx.Module):
         # add mean effects only to hypotheses with all wheels on one floor: only these were fitted
         effect = rolled.speed * mean @ rolled.axes.T
         xi = settled + jnp.zeros((len(hypotheses), 3)).at[hypotheses.uniform].set(effect)
+        if any(f.calibrated):
+            floors = np.flatnonzero(f.calibrated)
+            xi = xi.at[hypotheses.uniform[floors]].set(f.kinematics[floors] @ w)
         known_log, unknown_log = self._evidence(xi, predicted, currents, w, turn)
         # give evidence less weight while wheels accelerate, since the equilibrium neglects inertia
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)

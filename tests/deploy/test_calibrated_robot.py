@@ -1,0 +1,72 @@
+"""A robot that was calibrated alone: what is written, and what its estimator does."""
+
+import json
+
+import numpy as np
+import pytest
+
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.estimator import Estimator
+from slipid.robot.interface import Measurement
+from tests.benchmarks.every_robot.drive import write
+from tests.benchmarks.every_robot.rivals import read
+from tests.benchmarks.every_robot.robots import ROBOTS
+from tests.helpers.shared import invoke
+
+MADE = next(robot for robot in ROBOTS if robot.name == "diff_umbmark")
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made")
+    truth = write(MADE, folder, seed=1)
+    out = folder / "out"
+    done = invoke(
+        *("identify", folder / "robot.toml", "--data", folder / "logs"),
+        *("--out", out, "--only", "calibration", "--quiet"),
+    )
+    return folder, out, truth, done
+
+
+def test_its_files_say_what_was_calibrated_and_selected(calibrated):
+    _, out, _, done = calibrated
+    assert done.exit_code == 0
+    content = json.loads((out / "identified.json").read_text())
+    assert content["selected_model"] == {"floor": "calibrated"}
+    assert content["trust"]["verdict"] == "trusted"
+    assert "verdict: trusted" in done.stdout
+    track = content["calibration"]["surfaces"]["floor"]["effective_track_m"]
+    assert track["interval90"][0] < 0.170 < track["interval90"][1]
+    errors = content["trust"]["held_out_error_over_path"]["floor"]
+    assert errors["calibrated"] < 0.1 * errors["nominal"]
+
+
+def test_its_estimator_predicts_a_fresh_run(calibrated):
+    """From the first pose on, without another one; the true numbers are off by as much."""
+    folder, out, truth, _ = calibrated
+    robot = DeployedRobot.load(out / "robot.json")
+    assert robot.calibrated == (True,)
+    estimator = Estimator(robot)
+    for track in read(MADE, folder / "fresh")[:2]:
+        state = estimator.init(pose=tuple(track.pose[0]))
+        step = np.diff(track.t, prepend=track.t[0])
+        for angle, dt in zip(track.angle, step, strict=True):
+            state, estimate = estimator.step(state, Measurement(wheel_angle=angle), dt)
+        gap = np.asarray(estimate.pose)[:2] - track.pose[-1, :2]
+        assert np.hypot(*gap) < 0.015 * truth[track.name].path
+
+
+def test_its_kinematics_are_not_those_of_the_config(calibrated):
+    robot = DeployedRobot.load(calibrated[1] / "robot.json")
+    config = np.asarray(robot.inverse) * MADE.nominal_radius
+    assert not np.allclose(np.asarray(robot.kinematics[0]), config, rtol=0.02)
+
+
+def test_another_part_than_the_calibration_is_refused(calibrated):
+    folder, out, *_ = calibrated
+    done = invoke(
+        *("identify", folder / "robot.toml", "--data", folder / "logs", "--out", out),
+        *("--only", "slip", "--quiet"),
+    )
+    assert done.exit_code == 2
+    assert "--only slip: no such part; expected calibration" in done.stderr
