@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from slipid.app.calibrate import KinematicFit, calibrated, write_run
+from slipid.app.calibrate import calibrated, remarks, write_run
 from slipid.app.check import sanity
 from slipid.app.config import read_config
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
@@ -24,6 +24,7 @@ from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.selection import (
+    KinematicFit,
     calibrated_model,
     contact_errors,
     selected,
@@ -270,7 +271,12 @@ def summarised(
     report.stage("predicting held-out runs")
     contact = contact_errors(task.dataset, problem, optimum)
     selection = selected(task.dataset, {**kinematic.errors, "contact": contact})
-    fit = replace(fit, calibration=kinematic.calibration, selection=selection)
+    fit = replace(
+        fit,
+        calibration=kinematic.calibration,
+        selection=selection,
+        suspects=remarks(kinematic, selection),
+    )
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
 
