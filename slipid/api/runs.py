@@ -8,7 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.api.fit import Numbers, Prior, fit_task_of
-from slipid.app.check import ExpectedEstimate, ExpectedEstimates, expected, overview
+from slipid.app.check import (
+    ExpectedEstimate,
+    ExpectedEstimates,
+    calibration_part,
+    expected,
+    overview,
+)
 from slipid.data.runs import Runs, collect
 from slipid.lab.selftest import logs as known
 from slipid.lab.selftest.logs import simulate_logs
@@ -17,6 +23,7 @@ from slipid.parameter import as_numbers
 from slipid.report.estimates import show_check
 from slipid.report.page import text_of
 from slipid.support.content import Content
+from slipid.support.progress import Reporter
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +60,9 @@ def check(
     Arguments and errors are those of `fit`.
     """
     task = fit_task_of(runs, robot, priors or {}, fixed or {}, {}, free)
-    return LogCheck(overview(task), expected(task, task.problem()))
+    with Reporter(quiet=True) as report:
+        started, part = calibration_part(task, report)
+    return LogCheck(overview(task) | part, expected(started, started.problem()))
 
 
 @dataclass(frozen=True, eq=False)

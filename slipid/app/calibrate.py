@@ -1,6 +1,7 @@
 """Calibration of a robot's kinematics from the logs of a config, without a force balance."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,23 +11,10 @@ from slipid.app.problem import NO_BALANCE, ConfigFitTask, FitTask
 from slipid.fitting.calibration import Calibration
 from slipid.infer.fit_file import IDENTIFIED, SCHEMA
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
-from slipid.predict.selection import Errors, FloorSelection, kinematic_errors, selected
+from slipid.predict.selection import FloorSelection, KinematicFit, kinematic_fit, selected
 from slipid.search_space import Space
 from slipid.support.files import read_json, writable, write_json
 from slipid.support.progress import Reporter
-
-
-@dataclass(frozen=True, eq=False)
-class KinematicFit:
-    """Calibrated kinematics of a task.
-
-    Attributes:
-        calibration: calibration from all runs.
-        errors: errors of the kinematic models on held-out runs.
-    """
-
-    calibration: Calibration
-    errors: Errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +40,64 @@ def calibrated(task: FitTask, report: Reporter) -> KinematicFit:
     """Return the calibrated kinematics of a task, and report their numbers."""
     report.stage("calibrated kinematics")
     space = Space(task.robot, task.choices)
-    found = KinematicFit(*kinematic_errors(task.dataset, space, task.choices))
+    found = kinematic_fit(task.dataset, space, task.choices)
     for sentence in found.calibration.sentences:
         report.line(sentence)
     return found
+
+
+SLIP_SEEN = 0.01
+"""Relative difference of rolling radii between floors, and std of the runs' effects per distance,
+above which slip is seen [1]."""
+FAR_FROM_CONFIG = 0.02
+"""Relative difference of a calibrated length from the config's that is reported [1]."""
+
+
+def remarks(found: KinematicFit, selection: Mapping[str, FloorSelection]) -> tuple[str, ...]:
+    """Return sentences about what the runs do not tell, and about suspected errors in the config.
+
+    They are suspects, not reasons against the result: the calibrated numbers are used.
+    """
+    c = found.calibration
+    out = list(found.suspects)
+    what = "base" if c.sideways else "track"
+    straight = [f for f, v in c.base.items() if v.verdict == "not_identified"]
+    if len(straight) == len(c.base):
+        out.append(
+            f"no run turns: the effective {what} and the place of the pose sensor are not "
+            "identified; drive curves or turns on the spot"
+        )
+    elif straight:
+        out.append(f"on {', '.join(straight)} no run turns: the effective {what} is not identified")
+    for floor, one in selection.items():
+        if one.runs == 1:
+            out.append(f"on {floor} one run alone: intervals come from its parts; drive several")
+    for name, value, nominal in (
+        ("wheel radius", _mean_radius(c), c.nominal_radius),
+        (what, c.base[c.firmest].value, c.nominal_base),
+    ):
+        if abs(value / nominal - 1) > FAR_FROM_CONFIG and (name != what or not straight):
+            out.append(
+                f"the {name} in the config is {1e3 * nominal:.4g} mm; on {c.firmest} it is "
+                f"{1e3 * value:.4g} mm ({100 * (value / nominal - 1):+.1f} %)"
+            )
+    apart = [abs(v.value / _mean_radius(c) - 1) for row in c.radius.values() for v in row]
+    effects = [max(x[:2]) for x in c.noise.effect.values()]
+    kinematic = all(one.model != "contact" for one in selection.values())
+    if kinematic and max(effects) < SLIP_SEEN and max(apart) < 2 * SLIP_SEEN:
+        out.append("no slip seen: effective lengths explain the motion")
+    elif kinematic and len(c.radius) == 1:
+        out.append(
+            "one floor alone: a constant slip looks the same as smaller wheels; a firm floor would "
+            "tell them apart"
+        )
+    return tuple(out)
+
+
+def _mean_radius(c: Calibration) -> float:
+    """Return the mean rolling radius on the firmest floor [m]."""
+    radii = c.radius[c.firmest]
+    return sum(v.value for v in radii) / len(radii)
 
 
 def calibrate_only(
@@ -72,7 +114,7 @@ def calibrate_only(
     began = time.monotonic()
     found = calibrated(task, report)
     selection = selected(task.dataset, found.errors)
-    trust = verdict_of_trust(selection)
+    trust = verdict_of_trust(selection, notes=remarks(found, selection))
     writable(out)
     runs = [log.name for log in task.logs]
     messages = [NO_BALANCE] if task.robot.geometry.driven is not None else []

@@ -4,9 +4,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from slipid.app.calibrate import calibrated, remarks
 from slipid.app.config import read_config
 from slipid.app.logs import layout_of
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
@@ -20,6 +22,7 @@ from slipid.infer import slip_curves as curves_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.predict.agreement import scatter
+from slipid.predict.selection import selected
 from slipid.search_space import Space
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -27,6 +30,7 @@ from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
+Task = TypeVar("Task", bound=FitTask)
 _AT_MOTOR = ("wheel_ticks", "motor_angle", "motor_speed", "motor_speed_command")
 """Channels at the motor shaft, which the gear ratio of a layout converts to motion of the wheel."""
 
@@ -180,6 +184,8 @@ def check(
     task = read_fit_task(read_config(config_path), data, report)
     report.stage("comparing logs with config")
     content = overview(task, task.skipped)
+    task, part = calibration_part(task, report)
+    content |= part
     report.stage("expected information")
     try:
         estimates_before = expected(task, task.problem())
@@ -190,6 +196,17 @@ def check(
     if out is not None:
         write_json(out / "check.json", content)
     return task.dataset, content
+
+
+def calibration_part(task: Task, report: Reporter) -> tuple[Task, Content]:
+    """Return the task started from its calibration, and the part of check.json about it."""
+    try:
+        found = calibrated(task, report)
+    except DataError as error:  # no run has poses while its wheels turn
+        return task, {"suspects": [f"no calibration: {error}"]}
+    suspects = remarks(found, selected(task.dataset, found.errors))
+    content = {"calibration": found.calibration.to_json(), "suspects": list(suspects)}
+    return task.started_from(found.calibration), content
 
 
 def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:

@@ -183,6 +183,11 @@ class LogsSection(Section):
         session_name: name of the session of all runs of this section, instead of `session`;
             sections with the same name share a session. Example: all runs of one day.
         min_rows: runs with fewer rows are left out.
+        end_poses: table of poses at the ends of runs, measured by hand, for logs without poses; its
+            path is relative to the data folder. Its columns are run (path of the log relative to
+            the data folder), x_m, y_m and heading_deg (counting full turns) at the end, and
+            start_x_m, start_y_m and start_heading_deg, 0 if absent; cells may be empty. Such runs
+            calibrate the kinematics alone.
     """
 
     glob: str
@@ -193,6 +198,7 @@ class LogsSection(Section):
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
     session_name: str | None = Field(default=None, min_length=1)
     min_rows: int = Field(default=2, ge=2)
+    end_poses: str | None = None
 
     @model_validator(mode="after")
     def _one_floor_or_many(self) -> "LogsSection":

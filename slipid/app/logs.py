@@ -5,9 +5,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from zipfile import ZipFile
 
-from slipid.app.config import Config, LogsSection
+import numpy as np
+
+from slipid.app.config import Config, LogsSection, geometry
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
+from slipid.data.reading.end_poses import EndPoses, read_end_poses, refuse_unused
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of, without_beside
 from slipid.data.runs import Runs, collect, counted_once
@@ -49,6 +52,8 @@ def read_dataset(
     for section, paths in found:
         layout = layout_of(config, section)
         surface = None if section.map is not None else section.surface
+        table = {} if section.end_poses is None else read_end_poses(root / section.end_poses)
+        seen: list[str] = []
         for path in paths:
             inside = read_logs(path, layout, root, surface, section.load)
             aside += inside.aside
@@ -56,6 +61,12 @@ def read_dataset(
                 if log.samples < section.min_rows:
                     short += 1
                     continue
+                seen.append(log.name)
+                if section.end_poses is not None:
+                    if log.name not in table:
+                        aside.append(f"set aside: {log.name}: no row in {section.end_poses}")
+                        continue
+                    log = _with_ends(config, log, table[log.name])
                 if log.name in sessions:
                     raise DataError(
                         f"{log.name}: found by two globs of {config.path}; expected it once"
@@ -64,12 +75,23 @@ def read_dataset(
                 logs.append(log)
             done += 1
             report.advance(done, count)
+        if glob is None:
+            refuse_unused(table, seen)
     if short:
         skipped.append(f"skipped: {short} runs with fewer rows than the min_rows of their section")
     if not logs:
         nothing = f"{root}: no run in any file of {config.path}; expected logs with a moving robot"
         raise DataError("\n".join([*aside, *skipped]) or nothing)
     return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
+
+
+def _with_ends(config: Config, log: Log, ends: EndPoses) -> Log:
+    """Return a log with the poses at its ends, whose heading must agree with the wheels."""
+    shape = geometry(config.content.wheels)
+    if shape.driven is None and shape.drives == log.wheels:
+        yaw = np.asarray(shape.pseudo_inverse())[2] * float(shape.wheel_radius)
+        ends.check_turn(float((log.wheel_angle[-1] - log.wheel_angle[0]) @ yaw))
+    return ends.of(log)
 
 
 def required_files(
@@ -95,8 +117,7 @@ def files_of(
             found.append((section, _files(root, section.glob, f"{config.path}: logs.glob")))
         except DataError as error:
             skipped.append(f"skipped: {error}")
-    own = [(one, without_beside(paths, layout_of(config, one))) for one, paths in found]
-    return own, skipped
+    return _of_runs(config, found, root), skipped
 
 
 def matching_files(
@@ -124,8 +145,18 @@ def matching_files(
                 + ", ".join(f"'{one.glob}'" for one in sections)
             )
         out.append((sections[0], rest))
-    own = [(one, without_beside(paths, layout_of(config, one))) for one, paths in out if paths]
-    return [(one, paths) for one, paths in own if paths]
+    return [(one, paths) for one, paths in _of_runs(config, out, root) if paths]
+
+
+def _of_runs(
+    config: Config, found: Sequence[tuple[LogsSection, list[Path]]], root: Path
+) -> list[tuple[LogsSection, list[Path]]]:
+    """Return log sections with their files, without additional files and tables of end poses."""
+    tables = {root / one.end_poses for one in config.content.logs if one.end_poses is not None}
+    return [
+        (one, [p for p in without_beside(paths, layout_of(config, one)) if p not in tables])
+        for one, paths in found
+    ]
 
 
 def _files(root: Path, glob: str, where: str) -> list[Path]:

@@ -91,6 +91,8 @@ MOST_ROUNDS, MOST_STEPS, SETTLED = 6, 5, 0.1
 rounds end [std]."""
 RECUT_S = 0.02
 """Change of the lag after which wheel turns are computed anew [s]."""
+MOST_START = 64
+"""Number of runs above which a calibration starts from that of so many of them."""
 NOISE_TRACKS = 12
 """Largest number of runs on each floor from which variances are estimated."""
 _TYPICAL = np.log(np.array([0.003, 0.005, 0.005, 0.005, 0.01, 0.005, 0.005, 0.01]) ** 2)
@@ -543,6 +545,7 @@ class _Fit:
         log_variance: logarithms of the variances: of positions and headings, then for each floor
             six of the motion, as in `innovations`.
         weight: weight of each track [1].
+        runs: indices of the runs from which tracks are cut, None for all.
     """
 
     model: _Model
@@ -551,6 +554,7 @@ class _Fit:
     z: Float[np.ndarray, " free"]
     log_variance: Float[np.ndarray, " variance"]
     weight: Float[np.ndarray, " track"]
+    runs: Int[np.ndarray, " some"] | None = None
 
     @cached_property
     def floor(self) -> Int[np.ndarray, " track"]:
@@ -664,12 +668,8 @@ class _Fit:
 
     def with_noise(self) -> "_Fit":
         """Return the fit with variances of largest posterior, from some of the tracks."""
-        some = []
-        for k in range(len(self.model.floors)):
-            mine = np.flatnonzero(self.floor[: len(self.tracks.run)] == k)
-            at = np.linspace(0, len(mine) - 1, min(NOISE_TRACKS, len(mine)))
-            some.append(mine[at.round().astype(int)])
-        part = self.of_tracks(np.concatenate(some))
+        floor = self.floor[: len(self.tracks.run)]
+        part = self.of_tracks(_evenly(floor, NOISE_TRACKS * len(np.unique(floor))))
         typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:], len(self.model.floors))])
         numbers = part.motion(self.z)
 
@@ -753,6 +753,16 @@ def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
         z[model.free.index("lag")] = lag.seconds
     typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:] + 2.0, len(model.floors))])
     fit = _started(model, data, z, typical)
+    if len(data) <= MOST_START:
+        return _rounds(fit, choices)
+    # Many runs only refine what a part of them has found.
+    some = _evenly([log.surface or "unknown" for log in data.logs], MOST_START)
+    part = _rounds(_cut(replace(fit, runs=some)), choices)
+    return _rounds(_cut(replace(part, runs=None)), choices)
+
+
+def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
+    """Return the fit after rounds that estimate the numbers, the variances and the weights."""
     for _ in range(MOST_ROUNDS):
         before = fit
         fit = fit.solved().with_noise().with_weights()
@@ -765,8 +775,18 @@ def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
             and _in_stds(fit.z - before.z, fit.gradient[1]) < SETTLED
         ):
             break
-
     return fit
+
+
+def _evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
+    """Return indices of at most about `most` elements, evenly from each floor."""
+    label = np.asarray(floors)
+    some, names = [], np.unique(label)
+    for name in names:
+        mine = np.flatnonzero(label == name)
+        at = np.linspace(0, len(mine) - 1, min(int(np.ceil(most / len(names))), len(mine)))
+        some.append(mine[at.round().astype(int)])
+    return np.concatenate(some)
 
 
 def _in_stds(
@@ -781,7 +801,7 @@ def _cut(fit: _Fit) -> _Fit:
     shape = fit.model.space.template.geometry
     nominal = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
     arm, lag = 0.5 * nominal_base(shape), float(fit.model.column("lag", fit.z))
-    tracks = pose_tracks(fit.data, lag, nominal, arm, nominal_steering(shape))
+    tracks = pose_tracks(fit.data, lag, nominal, arm, nominal_steering(shape), fit.runs)
     return replace(fit, tracks=tracks, weight=np.ones(len(tracks.pose)))
 
 
@@ -830,8 +850,9 @@ def _changes(fit: _Fit) -> Float[np.ndarray, "part free"]:
     parts = max(1, int(np.ceil(LEAST_CLUSTERS / runs)))
     out = []
     for n in range(runs):
-        used = max(int(np.isfinite(fit.tracks.pose[n, 1:]).any(axis=1).sum()), 1)
-        part = np.repeat(np.minimum(np.arange(r.shape[1] // 3) * parts // used, parts - 1), 3)
+        posed = np.isfinite(fit.tracks.pose[n, 1:]).any(axis=1)
+        at = (np.cumsum(posed) - 1).clip(0)
+        part = np.repeat(at * parts // max(int(posed.sum()), 1), 3)
         for k in range(parts):
             mine = slope[n][part == k]
             out.append(np.linalg.solve(a - mine.T @ mine, mine.T @ r[n][part == k]))

@@ -16,6 +16,7 @@ at the ends of a run. The start of every run is free.
 Source: innovations form of the likelihood, Schweppe 1965, IEEE Transactions on Information Theory.
 """
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +31,9 @@ from slipid.support.errors import DataError
 
 POSE_PERIOD_S = 0.2
 """Shortest time between two poses that are used [s]."""
+LONGEST_GAP_S = 0.8
+"""Time between poses above which rows without a pose are added, so that the motion between them is
+computed in short steps [s]."""
 MOST_POSES, LEAST_POSES, ALL_POSES = 300, 20, 12_000
 """Largest number of poses of a run that are used, number to which it is reduced if there are many
 runs, and number of poses of all runs at which the reduction begins."""
@@ -83,6 +87,7 @@ def pose_tracks(
     nominal: Float[np.ndarray, "3 drive"],
     arm: float,
     steering: Steering | None = None,
+    runs: Int[np.ndarray, " some"] | None = None,
 ) -> PoseTracks:
     """Return the poses of runs whose true times, earlier by `lag` [s], have wheel angles.
 
@@ -92,13 +97,16 @@ def pose_tracks(
         nominal: matrix from wheel turns [rad] to body increments by which distances are computed.
         arm: distance that a yaw of 1 rad counts as [m].
         steering: numbers of a robot that steers by which distances are computed; else None.
+        runs: indices of the runs, None for all.
 
     Raises:
         DataError: no run has two such poses.
     """
-    most = int(np.clip(ALL_POSES // len(data), LEAST_POSES, MOST_POSES))
-    rows = [_picked(data, k, lag, most) for k in range(len(data))]
-    kept = [k for k, picked in enumerate(rows) if len(picked) > 1]
+    every = range(len(data)) if runs is None else runs.tolist()
+    most = int(np.clip(ALL_POSES // len(every), LEAST_POSES, MOST_POSES))
+    picked = {k: _picked(data, k, lag, most) for k in every}
+    rows = {k: _without_gaps(data, k, some, most) for k, some in picked.items()}
+    kept = [k for k, some in picked.items() if len(some) > 1]
     if not kept:
         raise DataError(
             f"{data.logs[0].name}: no two poses with wheel angles at the same time, in this run "
@@ -111,7 +119,8 @@ def pose_tracks(
         size = len(rows[k])
         time[n, :size] = data.time[data.rows(k)][rows[k]]
         time[n, size:] = time[n, size - 1]
-        pose[n, :size] = data.pose[data.rows(k)][rows[k]]
+        posed = np.isin(rows[k], picked[k])
+        pose[n, :size][posed] = data.pose[data.rows(k)][picked[k]]
     between = np.diff(time, axis=1)
     steps = _size(int(np.clip(np.median(between[between > 0]) / SUBSTEP_S, 1, MOST_SUBSTEPS)))
     part = np.arange(steps) / steps
@@ -144,6 +153,8 @@ def _picked(data: Runs, run: int, lag: float, most: int) -> Int[np.ndarray, " po
     rows = data.rows(run)
     time, fresh = data.time[rows], np.flatnonzero(data.fresh[rows])
     fresh = fresh[np.isfinite(data.pose[rows][fresh]).any(axis=1)]
+    if len(fresh) < 3:
+        return fresh  # poses of a robot at rest, before and after its run
     true_time = time[fresh] - lag
     fresh = fresh[(true_time >= time[0] - 1e-9) & (true_time <= time[-1] + 1e-9)]
     if len(fresh) < 3:
@@ -152,6 +163,24 @@ def _picked(data: Runs, run: int, lag: float, most: int) -> Int[np.ndarray, " po
     count = int(min(np.floor((t[-1] - t[0]) / POSE_PERIOD_S) + 1, most))
     at = np.searchsorted(t, np.linspace(t[0], t[-1], max(count, 2)) - 1e-9)
     return fresh[np.unique(at.clip(0, len(t) - 1))]
+
+
+def _without_gaps(
+    data: Runs, run: int, picked: Int[np.ndarray, " pose"], most: int
+) -> Int[np.ndarray, " row"]:
+    """Return picked rows of a run, with further rows where they are far apart in time."""
+    time = data.time[data.rows(run)]
+    t = time[picked]
+    if len(t) < 2:
+        return picked
+    longest = max(LONGEST_GAP_S, (t[-1] - t[0]) / most)
+    counts = np.ceil(np.diff(t) / longest - 1e-6).astype(int)
+    between = [
+        np.linspace(*ends, count, endpoint=False)[1:]
+        for ends, count in zip(pairwise(t), counts, strict=True)
+    ]
+    added = np.searchsorted(time, np.concatenate(between)).clip(0, len(time) - 1)
+    return np.union1d(picked, added)
 
 
 class Motion(NamedTuple):

@@ -19,7 +19,7 @@ Breiman et al. 1984, Classification and Regression Trees; folds by one Newton st
 2017, NeurIPS.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -31,7 +31,6 @@ from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
 from slipid.model.geometry import Geometry
-from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.folds import fold_keys, sectors
 from slipid.predict.kinematics import Calibrated, nominal
@@ -47,6 +46,9 @@ LEAST_SECTORS, MOST_GROUPS = 4, 6
 groups of runs otherwise."""
 MOST_RUNS = 48
 """Largest number of held-out runs that are predicted on a floor, picked evenly."""
+OUTLIER_RATIO = 3.0
+"""A run is suspected to be on another floor if its error exceeds the floor's median error, and the
+error as if it were on the other floor, by more than this factor [1]."""
 MODELS = ("nominal", "calibrated", "contact")
 """Slip models that may be selected, in order of size."""
 Errors = Mapping[str, Float[np.ndarray, " run"]]
@@ -109,22 +111,62 @@ def calibrated_model(calibration: Calibration, shape: Geometry) -> FloorModels:
     return FloorModels(model).with_state(numbers)
 
 
-def kinematic_errors(
-    data: Runs, space: Space, choices: Sequence[Choice]
-) -> tuple[Calibration, Errors]:
-    """Return the calibration, and the errors of `nominal` and `calibrated` on held-out runs.
+@dataclass(frozen=True, eq=False)
+class KinematicFit:
+    """Calibrated kinematics of runs, and how kinematic models predict held-out runs.
+
+    Attributes:
+        calibration: calibration from all runs.
+        errors: errors of the kinematic models on held-out runs.
+        suspects: sentences about runs that probably have a wrong floor label.
+    """
+
+    calibration: Calibration
+    errors: Errors
+    suspects: tuple[str, ...]
+
+
+def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> KinematicFit:
+    """Return the calibration of runs, and errors of `nominal` and `calibrated` on held-out runs.
 
     Arguments are those of `slipid.fitting.calibration.calibrate`.
     """
     fold, robot = selection_folds(data), space.template
     whole, without = cross_calibrated(data, space, choices, fold)
-    errors = {name: np.full(len(data), np.nan) for name in MODELS[:2]}
+    floors = list(whole.radius)
+    names = [*MODELS[:2], *floors]
+    errors = {name: np.full(len(data), np.nan) for name in names}
     plain = FloorModels(nominal(robot.geometry))
     for k, runs in _picked(data, fold).items():
         calibration = without.get(k, whole)
-        models = {"nominal": plain, "calibrated": calibrated_model(calibration, robot.geometry)}
-        _add_errors(errors, models, calibration.seen(robot), data, runs)
-    return whole, errors
+        seen, own = calibration.seen(robot), calibrated_model(calibration, robot.geometry)
+        for w in replay.replay_windows(data.subset(runs), seen):
+            cases = {"nominal": (plain, w), "calibrated": (own, w)}
+            if len(floors) > 1:
+                cases |= {f: (own, replace(w, surface=(f,) * len(w))) for f in floors}
+            for name, (model, at) in cases.items():
+                tracks = replay.tracks_from_increments(seen, w, model.increments(at, seen))
+                errors[name][runs[tracks.run]] = path_errors(tracks)
+    kept = {name: errors[name] for name in MODELS[:2]}
+    return KinematicFit(whole, kept, tuple(_mislabelled(data, errors, floors)))
+
+
+def _mislabelled(data: Runs, errors: Errors, floors: Sequence[str]) -> Iterator[str]:
+    """Yield a sentence for every run that the kinematics of another floor predict far better."""
+    label = np.array([log.surface or "unknown" for log in data.logs])
+    usual = {f: float(np.nanmedian(errors["calibrated"][label == f])) for f in floors}
+    for k, log in enumerate(data.logs):
+        own = errors["calibrated"][k]
+        others = {f: errors[f][k] for f in floors if f != label[k]}
+        if not others or not own > OUTLIER_RATIO * usual[label[k]]:
+            continue
+        best = min(others, key=lambda f: others[f])
+        if others[best] < own / OUTLIER_RATIO and others[best] < OUTLIER_RATIO * usual[best]:
+            yield (
+                f"{log.name}: labelled {label[k]}, but the wheels roll as on {best} (off by "
+                f"{100 * others[best]:.2f} % of the path, on {label[k]} by {100 * own:.2f} %): "
+                "check the label of its floor"
+            )
 
 
 def contact_errors(data: Runs, problem: Problem, optimum: Optimum) -> Float[np.ndarray, " run"]:
@@ -209,13 +251,3 @@ def _picked(data: Runs, fold: Int[np.ndarray, " run"]) -> dict[int, Int[np.ndarr
         some.append(mine[at.round().astype(int)])
     runs = np.concatenate(some)
     return {k: runs[fold[runs] == k] for k in sorted(set(fold[runs].tolist()))}
-
-
-def _add_errors(
-    errors: Errors, models: Mapping[str, FloorModels], seen: Robot, data: Runs, runs: np.ndarray
-) -> None:
-    """Set the errors of models on some runs; `seen` has the pose sensor that measures the runs."""
-    for w in replay.replay_windows(data.subset(runs), seen):
-        for name, model in models.items():
-            tracks = replay.tracks_from_increments(seen, w, model.increments(w, seen))
-            errors[name][runs[tracks.run]] = path_errors(tracks)

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
+from slipid.fitting.calibration import Calibration
 from slipid.report.page import Page, percent, table, verdict
 from slipid.support.content import Content
 
 if TYPE_CHECKING:
-    from slipid.fitting.calibration import Calibration, Value
+    from slipid.fitting.calibration import Value
     from slipid.infer.bench.verdict import BenchFit
     from slipid.infer.posterior.diagnosis import Posterior
     from slipid.infer.result import Fit
@@ -96,7 +97,7 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
-def show_calibration(page: Page, found: "Calibration") -> None:
+def show_calibration(page: Page, found: Calibration) -> None:
     """Write calibrated lengths, floor by floor, and the place of the pose sensor."""
     page.table(calibration_table(found))
     for floor, (radius, base) in found.multipliers.items():
@@ -107,7 +108,7 @@ def show_calibration(page: Page, found: "Calibration") -> None:
         )
 
 
-def calibration_table(found: "Calibration") -> Table:
+def calibration_table(found: Calibration) -> Table:
     """Return a table of calibrated numbers."""
     columns = ("calibration", "value", "unit", "90 % interval", "verdict")
     made = table(columns, right=("value",))
@@ -191,6 +192,9 @@ def show_check(page: Page, found: Content) -> None:
         page.line(_clocks(found["clocks"]))
     for note, count in found["notes"].items():
         page.line(f"repaired in {count} runs: {note}")
+    if "calibration" in found:
+        show_calibration(page, Calibration.of_json(found["calibration"]))
+    page.notes(found["suspects"])
     page.line(
         "before a fit: what a fit may find, from the least to the most informative of plausible "
         "floors, motors and noise; only the fit itself can find at bound or disputed"
