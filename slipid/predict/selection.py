@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.data.runs import Runs
+from slipid.data.windows import lacking_pose
 from slipid.fitting.calibration import Calibration, cross_calibrated
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
@@ -61,7 +62,8 @@ class FloorSelection:
 
     Attributes:
         model: the selected model.
-        errors: mean error of held-out runs over their path length, keyed by model [1].
+        errors: mean error of held-out runs over their path length, keyed by model [1]; empty if no
+            run was predicted, since none has positions with headings.
         behind: mean difference to the best model's error, and its standard error, keyed by model
             [1]; the standard error is nan with fewer than two clusters.
         runs: number of predicted runs.
@@ -137,7 +139,11 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
     names = [*MODELS[:2], *floors]
     errors = {name: np.full(len(data), np.nan) for name in names}
     plain = FloorModels(nominal(robot.geometry))
-    for k, runs in _picked(data, fold).items():
+    whole_poses = np.array([not lacking_pose(data, k) for k in range(len(data))])
+    for k, some in _picked(data, fold).items():
+        runs = some[whole_poses[some]]
+        if not len(runs):
+            continue
         calibration = without.get(k, whole)
         seen, own = calibration.seen(robot), calibrated_model(calibration, robot.geometry)
         for w in replay.replay_windows(data.subset(runs), seen):
@@ -154,11 +160,13 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
 def _mislabelled(data: Runs, errors: Errors, floors: Sequence[str]) -> Iterator[str]:
     """Yield a sentence for every run that the kinematics of another floor predict far better."""
     label = np.array([log.surface or "unknown" for log in data.logs])
+    known = np.isfinite(errors["calibrated"])
+    floors = [f for f in floors if known[label == f].any()]
     usual = {f: float(np.nanmedian(errors["calibrated"][label == f])) for f in floors}
     for k, log in enumerate(data.logs):
         own = errors["calibrated"][k]
         others = {f: errors[f][k] for f in floors if f != label[k]}
-        if not others or not own > OUTLIER_RATIO * usual[label[k]]:
+        if not known[k] or not others or not own > OUTLIER_RATIO * usual[label[k]]:
             continue
         best = min(others, key=lambda f: others[f])
         if others[best] < own / OUTLIER_RATIO and others[best] < OUTLIER_RATIO * usual[best]:
@@ -202,6 +210,9 @@ def selected(data: Runs, errors: Errors) -> dict[str, FloorSelection]:
     for name in sorted(set(floor.tolist())):
         each = {m: x[floor == name] for m, x in errors.items()}
         seen = np.all([np.isfinite(x) for x in each.values()], axis=0)
+        if not seen.any():
+            out[name] = FloorSelection("calibrated", {}, {}, 0, False)
+            continue
         each = {m: x[seen] for m, x in each.items()}
         mean = {m: float(x.mean()) for m, x in each.items()}
         best = min(mean, key=lambda m: mean[m])
