@@ -141,7 +141,7 @@ def calibration_table(found: Calibration) -> Table:
 
 def show_trust(page: Page, found: "Trust") -> None:
     """Write the errors of slip models on held-out runs, the selected ones, and the verdict."""
-    models = list(max((f.errors for f in found.floors.values()), key=len, default={}))
+    models = list(dict.fromkeys(m for floor in found.floors.values() for m in floor.errors))
     made = table(("surface", *models, "selected", "runs"))
     for name, floor in found.floors.items():
         each = (percent(floor.errors[m]) if floor.errors else "-" for m in models)
