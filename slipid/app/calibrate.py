@@ -7,7 +7,7 @@ from pathlib import Path
 
 from slipid.app.bench_priors import COPY_NAME
 from slipid.app.logs import write_run_file
-from slipid.app.problem import ConfigFitTask, FitTask
+from slipid.app.problem import NO_BALANCE, ConfigFitTask, FitTask
 from slipid.fitting.calibration import Calibration
 from slipid.infer.fit_file import IDENTIFIED, SCHEMA
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
@@ -117,6 +117,7 @@ def calibrate_only(
     trust = verdict_of_trust(selection, notes=remarks(found, selection))
     writable(out)
     runs = [log.name for log in task.logs]
+    messages = [NO_BALANCE] if task.robot.geometry.driven is not None else []
     content = {
         "schema": SCHEMA,
         "parameters": {},
@@ -124,7 +125,7 @@ def calibrate_only(
         "surfaces": list(task.robot.surfaces.labels),
         "curves": {},
         "validity": {},
-        "messages": ["calibrated kinematics alone: no force balance was fitted"],
+        "messages": ["calibrated kinematics alone: no force balance was fitted", *messages],
         "calibration": found.calibration.to_json(),
         "selected_model": {floor: one.model for floor, one in selection.items()},
         "trust": trust.to_json(),

@@ -210,13 +210,17 @@ class ConfigFitTask(FitTask):
     skipped: tuple[str, ...]
 
 
+NO_BALANCE = (
+    "no force balance for steered wheels: radius, wheelbase and steering are calibrated from "
+    "poses, and forces, motors and loads are not fitted"
+)
+"""Sentence about what is not fitted of a robot that steers."""
+
+
 def refuse_steered(shape: Geometry) -> None:
     """Raise `NoForceBalance` if a wheel is steered, which no force balance describes."""
     if shape.driven is not None:
-        raise NoForceBalance(
-            "no force balance for steered wheels: radius, wheelbase and steering are calibrated "
-            "from poses, and forces, motors and loads are not fitted"
-        )
+        raise NoForceBalance(NO_BALANCE)
 
 
 def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask:

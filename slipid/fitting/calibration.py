@@ -191,9 +191,8 @@ class Calibration:
             )
             names, radii = (["mean"], radii[:1]) if self.steering else (names, radii)
             each = ", ".join(f"{n} {_mm(v)}" for n, v in zip(names, radii, strict=True))
-            what = "base" if self.sideways else "wheelbase" if self.steering else "track"
             ratio = self.multipliers[floor][1]
-            line = f"{floor}: wheel radius {each}; effective {what} {_mm(self.base[floor])}"
+            line = f"{floor}: wheel radius {each}; effective {self.length} {_mm(self.base[floor])}"
             line += f", {ratio:.3f} of nominal"
             if floor in self.centre and self.centre[floor].verdict != "fixed":
                 line += f"; turns about a point {_mm(self.centre[floor])} ahead of the middle"
@@ -206,6 +205,11 @@ class Calibration:
             f"{np.degrees(self.yaw.value):.2f} deg; poses are {1e3 * self.lag.value:.0f} ms late"
         )
         return tuple(lines)
+
+    @property
+    def length(self) -> str:
+        """Name of the length that `base` is the effective one of."""
+        return "wheelbase" if self.steering else "base" if self.sideways else "track"
 
     def _of_steering(self) -> str:
         """Return a line about the steering, which says what only priors tell."""
