@@ -82,6 +82,7 @@ def identify(
             reported.
 
     Raises:
+        NoForceBalance: the robot's wheels or the poses allow a calibration only.
         DataError: config or logs are wrong; in this case nothing was written.
     """
     began = time.monotonic()

@@ -26,19 +26,22 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.data.runs import Runs
-from slipid.data.windows import lacking_pose
+from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration import Calibration, cross_calibrated
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
 from slipid.model.geometry import Geometry
+from slipid.model.kinematics import nominal_base
+from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.folds import fold_keys, sectors
 from slipid.predict.kinematics import Calibrated, nominal
 from slipid.predict.predictive import force_balance_of
 from slipid.predict.score import clusters, mean_error
-from slipid.predict.slip_model import turned
+from slipid.predict.slip_model import RobotSpec, RunSignals, path_of, turned
 from slipid.predict.slip_models import FloorModels
+from slipid.predict.steps import Steps, TwistModel
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 
@@ -62,8 +65,7 @@ class FloorSelection:
 
     Attributes:
         model: the selected model.
-        errors: mean error of held-out runs over their path length, keyed by model [1]; empty if no
-            run was predicted, since none has positions with headings.
+        errors: mean error of held-out runs over their path length, keyed by model [1].
         behind: mean difference to the best model's error, and its standard error, keyed by model
             [1]; the standard error is nan with fewer than two clusters.
         runs: number of predicted runs.
@@ -139,14 +141,16 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
     names = [*MODELS[:2], *floors]
     errors = {name: np.full(len(data), np.nan) for name in names}
     plain = FloorModels(nominal(robot.geometry))
-    whole_poses = np.array([not lacking_pose(data, k) for k in range(len(data))])
-    for k, some in _picked(data, fold).items():
-        runs = some[whole_poses[some]]
-        if not len(runs):
-            continue
+    for k, runs in _picked(data, fold).items():
         calibration = without.get(k, whole)
         seen, own = calibration.seen(robot), calibrated_model(calibration, robot.geometry)
-        for w in replay.replay_windows(data.subset(runs), seen):
+        whole_poses = np.array([_has_whole_poses(data, run) for run in runs.tolist()])
+        for run in runs[~whole_poses].tolist():
+            floor = data.logs[run].surface or "unknown"
+            errors["nominal"][run] = aligned_error(data, run, plain.model, seen)
+            errors["calibrated"][run] = aligned_error(data, run, own.fitted[floor], seen)
+        runs = runs[whole_poses]
+        for w in replay.replay_windows(data.subset(runs), seen) if len(runs) else ():
             cases = {"nominal": (plain, w), "calibrated": (own, w)}
             if len(floors) > 1:
                 cases |= {f: (own, replace(w, surface=(f,) * len(w))) for f in floors}
@@ -157,16 +161,70 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
     return KinematicFit(whole, kept, tuple(_mislabelled(data, errors, floors)))
 
 
+def _has_whole_poses(data: Runs, run: int) -> bool:
+    """Return whether a run has enough poses with all coordinates to be predicted in steps."""
+    pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
+    return len(pose) > 2 and bool(np.isfinite(pose).all())
+
+
+PARTS_OF_GAP, LONGEST_PART_S = 4, 0.2
+"""Least number and longest duration of the steps in which the motion between two poses is computed
+for an aligned path."""
+
+
+def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float:
+    """Return the error over the path length of a run whose poses lack coordinates.
+
+    The start of such a run is not known. The whole predicted path of the pose sensor is therefore
+    aligned with the measured positions, by a rotation and a translation (Procrustes), and the error
+    is the root mean square of what remains. If the poses are those of the ends and the first one is
+    whole, the path begins at it, and the error is that of the end. Headings alone are aligned by
+    their mean, and an error of 1 rad counts as half the track or base.
+
+    Args:
+        data: the runs.
+        run: index of the run.
+        model: fitted slip model of the run's floor.
+        seen: robot with the calibrated pose sensor.
+    """
+    rows, lag, spec = data.rows(run), float(seen.camera.lag), RobotSpec.of(seen)
+    time, pose = data.time[rows], data.pose[rows]
+    shown = data.fresh[rows] & np.isfinite(pose).any(axis=1)
+    shown &= (time - lag >= time[0] - 1e-9) & (time - lag <= time[-1] + 1e-9)
+    pose, at = pose[shown], time[shown] - lag
+    parts = np.maximum(PARTS_OF_GAP, np.ceil(np.diff(at) / LONGEST_PART_S)).astype(int)
+    index = np.concatenate([[0], np.cumsum(parts)])
+    edges = np.interp(np.arange(index[-1] + 1), index, at)
+    turn = np.diff(interpolate(time, data.turned(run), edges), axis=0)
+    signals = RunSignals(data.logs[run].name, np.diff(edges), turn)
+    path = path_of(model.twist(Steps(signals, np.zeros(1, int)), spec), signals.dt)
+    length = max(float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()), 1e-9)
+    path = path[index]
+    offset = np.broadcast_to(np.asarray(seen.camera.marker_place), (len(path), 2))
+    known = np.isfinite(pose[:, :2]).all(axis=1)
+    if known.sum() < 2:
+        off = path[:, 2] - pose[:, 2]
+        return 0.5 * nominal_base(seen.geometry) * float(np.nanstd(off)) / length
+    found, measured = (
+        (x[known, 0] + 1j * x[known, 1]) for x in (path[:, :2] + turned(path[:, 2], offset), pose)
+    )
+    if len(pose) == 2 and np.isfinite(pose[0]).all():
+        found, measured = np.diff(found), np.diff(measured) * float(seen.camera.scale)
+        heading = pose[0, 2] - float(seen.camera.marker_yaw) - path[0, 2]
+        return float(np.abs(found * np.exp(1j * heading) - measured)[0]) / length
+    found, measured = found - found.mean(), (measured - measured.mean()) * float(seen.camera.scale)
+    turn_by = np.exp(1j * np.angle(np.vdot(found, measured)))
+    return float(np.sqrt(np.mean(np.abs(found * turn_by - measured) ** 2))) / length
+
+
 def _mislabelled(data: Runs, errors: Errors, floors: Sequence[str]) -> Iterator[str]:
     """Yield a sentence for every run that the kinematics of another floor predict far better."""
     label = np.array([log.surface or "unknown" for log in data.logs])
-    known = np.isfinite(errors["calibrated"])
-    floors = [f for f in floors if known[label == f].any()]
     usual = {f: float(np.nanmedian(errors["calibrated"][label == f])) for f in floors}
     for k, log in enumerate(data.logs):
         own = errors["calibrated"][k]
         others = {f: errors[f][k] for f in floors if f != label[k]}
-        if not known[k] or not others or not own > OUTLIER_RATIO * usual[label[k]]:
+        if not others or not own > OUTLIER_RATIO * usual[label[k]]:
             continue
         best = min(others, key=lambda f: others[f])
         if others[best] < own / OUTLIER_RATIO and others[best] < OUTLIER_RATIO * usual[best]:
@@ -210,9 +268,6 @@ def selected(data: Runs, errors: Errors) -> dict[str, FloorSelection]:
     for name in sorted(set(floor.tolist())):
         each = {m: x[floor == name] for m, x in errors.items()}
         seen = np.all([np.isfinite(x) for x in each.values()], axis=0)
-        if not seen.any():
-            out[name] = FloorSelection("calibrated", {}, {}, 0, False)
-            continue
         each = {m: x[seen] for m, x in each.items()}
         mean = {m: float(x.mean()) for m, x in each.items()}
         best = min(mean, key=lambda m: mean[m])

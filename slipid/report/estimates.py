@@ -141,10 +141,10 @@ def calibration_table(found: Calibration) -> Table:
 
 def show_trust(page: Page, found: "Trust") -> None:
     """Write the errors of slip models on held-out runs, the selected ones, and the verdict."""
-    models = list(dict.fromkeys(m for floor in found.floors.values() for m in floor.errors))
+    models = list(next(iter(found.floors.values())).errors) if found.floors else []
     made = table(("surface", *models, "selected", "runs"))
     for name, floor in found.floors.items():
-        each = (percent(floor.errors[m]) if floor.errors else "-" for m in models)
+        each = (percent(floor.errors[m]) for m in models)
         made.add_row(Text(name), *each, floor.model, str(floor.runs))
     if found.floors:
         page.line("held-out runs, open loop from the first pose: error over the path length")

@@ -128,7 +128,7 @@ def test_a_radius_that_is_given_makes_the_track_of_squares_sharp(squares):
     assert found.base["floor"].verdict == "identified"
 
 
-def test_identify_calibrates_such_runs_and_says_what_was_not_judged(squares, tmp_path):
+def test_identify_calibrates_such_runs_and_predicts_their_ends(squares, tmp_path):
     folder, lines = squares
     task_of(folder, lines)
     words = ("--data", folder / "logs", "--out", tmp_path, "--only", "calibration")
@@ -136,6 +136,7 @@ def test_identify_calibrates_such_runs_and_says_what_was_not_judged(squares, tmp
     assert done.exit_code == 0, done.stderr
     found = json.loads((tmp_path / "identified.json").read_text())
     assert found["selected_model"] == {"floor": "calibrated"}
-    assert found["trust"]["verdict"] == "doubtful"
-    assert "on floor no run has positions with headings" in found["trust"]["reasons"][0]
+    errors = found["trust"]["held_out_error_over_path"]["floor"]
+    assert errors["nominal"] > 0.03
+    assert errors["calibrated"] < 0.004
     assert "little of the mean wheel radius: drive some metres" in " ".join(done.stdout.split())

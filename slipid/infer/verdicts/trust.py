@@ -120,12 +120,6 @@ def verdict_of_trust(
 def _of_errors(floors: Mapping[str, FloorSelection]) -> Iterator[_Reason]:
     """Yield reasons against a fit from the errors of held-out runs, floor by floor."""
     for name, floor in floors.items():
-        if not floor.errors:
-            yield (
-                1,
-                f"on {name} no run has positions with headings, by which to judge predictions",
-            )
-            continue
         own, order = floor.errors[floor.model], list(floor.errors)
         simpler = order[: order.index(floor.model)]
         if not isfinite(own):
