@@ -118,7 +118,7 @@ def calibrate_only(
     """
     began = time.monotonic()
     found = calibrated(task, report)
-    selection = selected(task.dataset, found.errors)
+    selection = selected(task.dataset, found.errors, found.contradicted)
     trust = verdict_of_trust(selection, notes=remarks(found, selection))
     writable(out)
     runs = [log.name for log in task.logs]

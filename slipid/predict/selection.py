@@ -3,7 +3,9 @@
 The models stand in order of size: the lengths of the config (`nominal`), calibrated kinematics
 (`calibrated`), and the force balance (`contact`). On each floor the simplest one is selected whose
 mean error on held-out runs is within one standard error of the smallest; the standard error is that
-of the difference, paired run by run and clustered by sectors of the direction of travel.
+of the difference, paired run by run and clustered by sectors of the direction of travel. The
+config's lengths are selected only where the calibration does not contradict them: a few runs cannot
+show by their errors what other paths would.
 
 Runs are held out in folds: in sectors of the commanded direction if every floor was driven in at
 least `LEAST_SECTORS` of them, else in groups of runs. The models without a fold follow from the
@@ -19,7 +21,7 @@ Breiman et al. 1984, Classification and Regression Trees; folds by one Newton st
 2017, NeurIPS.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -50,6 +52,8 @@ LEAST_SECTORS, MOST_GROUPS = 4, 6
 groups of runs otherwise."""
 MOST_RUNS = 48
 """Largest number of held-out runs that are predicted on a floor, picked evenly."""
+CONTRADICTION = 2.6
+"""Distance of a length of the config from the calibrated one that contradicts it [std]."""
 OUTLIER_RATIO = 3.0
 """A run is suspected to be on another floor if its error exceeds the floor's median error, and the
 error as if it were on the other floor, by more than this factor [1]."""
@@ -66,8 +70,9 @@ class FloorSelection:
     Attributes:
         model: the selected model.
         errors: mean error of held-out runs over their path length, keyed by model [1].
-        behind: mean difference to the best model's error, and its standard error, keyed by model
-            [1]; the standard error is nan with fewer than two clusters.
+        behind: mean difference to the error of the best model that may be selected, and the
+            standard error of this difference, keyed by model [1]; the latter is nan with fewer than
+            two clusters.
         runs: number of predicted runs.
         held_out: True if the runs were predicted by models that were not fitted to them.
     """
@@ -128,6 +133,20 @@ class KinematicFit:
     calibration: Calibration
     errors: Errors
     suspects: tuple[str, ...]
+
+    @property
+    def contradicted(self) -> frozenset[str]:
+        """Floors on which the calibration contradicts a length of the config."""
+        c = self.calibration
+        return frozenset(
+            floor
+            for floor in c.radius
+            for value, given in (
+                *((radius, c.nominal_radius) for radius in c.radius[floor]),
+                (c.base[floor], c.nominal_base),
+            )
+            if abs(value.value - given) > CONTRADICTION * value.std
+        )
 
 
 def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> KinematicFit:
@@ -260,8 +279,16 @@ def contact_errors(data: Runs, problem: Problem, optimum: Optimum) -> Float[np.n
     return out
 
 
-def selected(data: Runs, errors: Errors) -> dict[str, FloorSelection]:
-    """Return the selection on every floor from the errors of all models, simplest model first."""
+def selected(
+    data: Runs, errors: Errors, contradicted: Collection[str]
+) -> dict[str, FloorSelection]:
+    """Return the selection on every floor.
+
+    Args:
+        data: the runs.
+        errors: errors of all models, simplest model first.
+        contradicted: floors on which the calibration contradicts the lengths of the config.
+    """
     floor = np.array([log.surface or "unknown" for log in data.logs])
     fold, cluster = selection_folds(data), clusters(np.degrees(data.heading).tolist())
     out = {}
@@ -270,12 +297,13 @@ def selected(data: Runs, errors: Errors) -> dict[str, FloorSelection]:
         seen = np.all([np.isfinite(x) for x in each.values()], axis=0)
         each = {m: x[seen] for m, x in each.items()}
         mean = {m: float(x.mean()) for m, x in each.items()}
-        best = min(mean, key=lambda m: mean[m])
+        able = [m for m in mean if m != "nominal" or name not in contradicted]
+        best = min(able, key=lambda m: mean[m])
         behind = {}
         for m, x in each.items():
             _, _, se = mean_error(x - each[best], cluster[floor == name][seen])
             behind[m] = (mean[m] - mean[best], float(se))
-        chosen = next(m for m, (gap, se) in behind.items() if m == best or gap <= se)
+        chosen = next(m for m in able if m == best or behind[m][0] <= behind[m][1])
         held_out = bool((fold[floor == name] >= 0).all())
         out[name] = FloorSelection(chosen, mean, behind, int(seen.sum()), held_out)
     return out
