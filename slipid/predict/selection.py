@@ -186,8 +186,9 @@ def _has_whole_poses(data: Runs, run: int) -> bool:
     return len(pose) > 2 and bool(np.isfinite(pose).all())
 
 
-PARTS_OF_GAP = 4
-"""Number of steps in which the motion between two poses is computed for an aligned path."""
+PARTS_OF_GAP, LONGEST_PART_S = 4, 0.2
+"""Least number and longest duration of the steps in which the motion between two poses is computed
+for an aligned path."""
 
 
 def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float:
@@ -195,8 +196,9 @@ def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float
 
     The start of such a run is not known. The whole predicted path of the pose sensor is therefore
     aligned with the measured positions, by a rotation and a translation (Procrustes), and the error
-    is the root mean square of what remains. Headings alone are aligned by their mean, and an error
-    of 1 rad counts as half the track or base.
+    is the root mean square of what remains. If the poses are those of the ends and the first one is
+    whole, the path begins at it, and the error is that of the end. Headings alone are aligned by
+    their mean, and an error of 1 rad counts as half the track or base.
 
     Args:
         data: the runs.
@@ -209,13 +211,14 @@ def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float
     shown = data.fresh[rows] & np.isfinite(pose).any(axis=1)
     shown &= (time - lag >= time[0] - 1e-9) & (time - lag <= time[-1] + 1e-9)
     pose, at = pose[shown], time[shown] - lag
-    grid = np.arange((len(at) - 1) * PARTS_OF_GAP + 1) / PARTS_OF_GAP
-    edges = np.interp(grid, np.arange(len(at)), at)
+    parts = np.maximum(PARTS_OF_GAP, np.ceil(np.diff(at) / LONGEST_PART_S)).astype(int)
+    index = np.concatenate([[0], np.cumsum(parts)])
+    edges = np.interp(np.arange(index[-1] + 1), index, at)
     turn = np.diff(interpolate(time, data.turned(run), edges), axis=0)
     signals = RunSignals(data.logs[run].name, np.diff(edges), turn)
     path = path_of(model.twist(Steps(signals, np.zeros(1, int)), spec), signals.dt)
     length = max(float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()), 1e-9)
-    path = path[::PARTS_OF_GAP]
+    path = path[index]
     offset = np.broadcast_to(np.asarray(seen.camera.marker_place), (len(path), 2))
     known = np.isfinite(pose[:, :2]).all(axis=1)
     if known.sum() < 2:
@@ -224,6 +227,10 @@ def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float
     found, measured = (
         (x[known, 0] + 1j * x[known, 1]) for x in (path[:, :2] + turned(path[:, 2], offset), pose)
     )
+    if len(pose) == 2 and np.isfinite(pose[0]).all():
+        found, measured = np.diff(found), np.diff(measured) * float(seen.camera.scale)
+        heading = pose[0, 2] - float(seen.camera.marker_yaw) - path[0, 2]
+        return float(np.abs(found * np.exp(1j * heading) - measured)[0]) / length
     found, measured = found - found.mean(), (measured - measured.mean()) * float(seen.camera.scale)
     turn_by = np.exp(1j * np.angle(np.vdot(found, measured)))
     return float(np.sqrt(np.mean(np.abs(found * turn_by - measured) ** 2))) / length
