@@ -669,7 +669,7 @@ class _Fit:
     def with_noise(self) -> "_Fit":
         """Return the fit with variances of largest posterior, from some of the tracks."""
         floor = self.floor[: len(self.tracks.run)]
-        part = self.of_tracks(_evenly(floor, NOISE_TRACKS * len(np.unique(floor))))
+        part = self.of_tracks(evenly(floor, NOISE_TRACKS * len(np.unique(floor))))
         typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:], len(self.model.floors))])
         numbers = part.motion(self.z)
 
@@ -756,7 +756,7 @@ def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
     if len(data) <= MOST_START:
         return _rounds(fit, choices)
     # Many runs only refine what a part of them has found.
-    some = _evenly([log.surface or "unknown" for log in data.logs], MOST_START)
+    some = evenly([log.surface or "unknown" for log in data.logs], MOST_START)
     part = _rounds(_cut(replace(fit, runs=some)), choices)
     return _rounds(_cut(replace(part, runs=None)), choices)
 
@@ -778,7 +778,7 @@ def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
     return fit
 
 
-def _evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
+def evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
     """Return indices of at most about `most` elements, evenly from each floor."""
     label = np.asarray(floors)
     some, names = [], np.unique(label)
