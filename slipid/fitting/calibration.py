@@ -191,9 +191,8 @@ class Calibration:
             )
             names, radii = (["mean"], radii[:1]) if self.steering else (names, radii)
             each = ", ".join(f"{n} {_mm(v)}" for n, v in zip(names, radii, strict=True))
-            what = "base" if self.sideways else "wheelbase" if self.steering else "track"
             ratio = self.multipliers[floor][1]
-            line = f"{floor}: wheel radius {each}; effective {what} {_mm(self.base[floor])}"
+            line = f"{floor}: wheel radius {each}; effective {self.length} {_mm(self.base[floor])}"
             line += f", {ratio:.3f} of nominal"
             if floor in self.centre and self.centre[floor].verdict != "fixed":
                 line += f"; turns about a point {_mm(self.centre[floor])} ahead of the middle"
@@ -206,6 +205,11 @@ class Calibration:
             f"{np.degrees(self.yaw.value):.2f} deg; poses are {1e3 * self.lag.value:.0f} ms late"
         )
         return tuple(lines)
+
+    @property
+    def length(self) -> str:
+        """Name of the length that `base` is the effective one of."""
+        return "wheelbase" if self.steering else "base" if self.sideways else "track"
 
     def _of_steering(self) -> str:
         """Return a line about the steering, which says what only priors tell."""
@@ -665,7 +669,7 @@ class _Fit:
     def with_noise(self) -> "_Fit":
         """Return the fit with variances of largest posterior, from some of the tracks."""
         floor = self.floor[: len(self.tracks.run)]
-        part = self.of_tracks(_evenly(floor, NOISE_TRACKS * len(np.unique(floor))))
+        part = self.of_tracks(evenly(floor, NOISE_TRACKS * len(np.unique(floor))))
         typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:], len(self.model.floors))])
         numbers = part.motion(self.z)
 
@@ -752,7 +756,7 @@ def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
     if len(data) <= MOST_START:
         return _rounds(fit, choices)
     # Many runs only refine what a part of them has found.
-    some = _evenly([log.surface or "unknown" for log in data.logs], MOST_START)
+    some = evenly([log.surface or "unknown" for log in data.logs], MOST_START)
     part = _rounds(_cut(replace(fit, runs=some)), choices)
     return _rounds(_cut(replace(part, runs=None)), choices)
 
@@ -774,7 +778,7 @@ def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
     return fit
 
 
-def _evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
+def evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
     """Return indices of at most about `most` elements, evenly from each floor."""
     label = np.asarray(floors)
     some, names = [], np.unique(label)
