@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slipid.app.calibrate import calibrated
 from slipid.app.config import FitSection
-from slipid.app.identify import optimised, summarised
+from slipid.app.identify import fitted
 from slipid.app.problem import FitTask, of_torques, robot_for_runs, stated_sizes
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
@@ -77,10 +76,7 @@ def fit(
     chosen = priors or {}, fixed or {}, start or {}, free
     task = fit_task_of(runs, robot, *chosen, image_centre, windows_per_piece, seed)
     with Reporter(quiet=quiet) as report:
-        kinematic = calibrated(task, report)
-        task = task.started_from(kinematic.calibration)
-        problem, optimum = optimised(task, task.problem(), None, report)
-        return summarised(task, problem, optimum, report, kinematic)
+        return fitted(task, report)[0]
 
 
 def fit_task_of(

@@ -9,7 +9,7 @@ import numpy as np
 
 from slipid.app.bench_priors import COPY_NAME
 from slipid.app.logs import write_run_file
-from slipid.app.problem import ConfigFitTask, FitTask
+from slipid.app.problem import NO_BALANCE, ConfigFitTask, FitTask
 from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration import ABSURD, Calibration
 from slipid.infer.fit_file import IDENTIFIED, SCHEMA
@@ -91,6 +91,11 @@ def remarks(
         )
     elif straight:
         out.append(f"on {', '.join(straight)} no run turns: the effective {what} is not identified")
+    if any(v.verdict in ("weak", "not_identified") for v in c.radius[c.firmest]):
+        out.append(
+            "the runs tell ratios of lengths, and little of the mean wheel radius: drive some "
+            "metres straight ahead with known positions at both ends"
+        )
     for floor, one in selection.items():
         if one.runs == 1:
             out.append(f"on {floor} one run alone: intervals come from its parts; drive several")
@@ -178,10 +183,11 @@ def calibrate_only(
     """
     began = time.monotonic()
     found = calibrated(task, report)
-    selection = selected(task.dataset, found.errors)
+    selection = selected(task.dataset, found.errors, found.contradicted)
     trust = verdict_of_trust(selection, notes=remarks(found, selection, task))
     writable(out)
     runs = [log.name for log in task.logs]
+    messages = [NO_BALANCE] if task.robot.geometry.driven is not None else []
     content = {
         "schema": SCHEMA,
         "parameters": {},
@@ -189,7 +195,7 @@ def calibrate_only(
         "surfaces": list(task.robot.surfaces.labels),
         "curves": {},
         "validity": {},
-        "messages": ["calibrated kinematics alone: no force balance was fitted"],
+        "messages": ["calibrated kinematics alone: no force balance was fitted", *messages],
         "calibration": found.calibration.to_json(),
         "selected_model": {floor: one.model for floor, one in selection.items()},
         "trust": trust.to_json(),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slipid.app.calibrate import calibrated
 from slipid.app.config import read_config, single_floor_sections
 from slipid.app.logs import read_dataset
 from slipid.app.problem import ConfigFitTask, read_fit_task
@@ -64,6 +65,7 @@ def compare(
         raise DataError(
             f"{config.path}: no run can be held out; expected runs with several headings or speeds"
         )
+    task = task.started_from(calibrated(task, report).calibration)
     report.stage("cutting windows")
     problem = task.problem()
     writable(out)

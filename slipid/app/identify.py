@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -82,26 +82,25 @@ def identify(
             reported.
 
     Raises:
+        NoForceBalance: the robot's wheels or the poses allow a calibration only.
         DataError: config or logs are wrong; in this case nothing was written.
     """
     began = time.monotonic()
     task = with_mixed(checked_task(config_path, data, report, anyway), data, report)
-    config = task.config
-    kinematic = calibrated(task, report)
-    task = task.started_from(kinematic.calibration)
-    problem = task.problem()
-    for path in profiles:
-        try:
-            profiled(problem.space, path)
-        except ValueError as error:
-            raise DataError(f"--profile: {error}") from error
-    writable(out)
-    if sentence := _replaced_fit(out, task):
-        report.line(sentence)
-    key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
-    kept = Checkpoint(out, key)
-    problem, optimum = optimised(task, problem, kept, report)
-    fit = summarised(task, problem, optimum, report, kinematic)
+
+    def begin(problem: Problem) -> Checkpoint:
+        for path in profiles:
+            try:
+                profiled(problem.space, path)
+            except ValueError as error:
+                raise DataError(f"--profile: {error}") from error
+        writable(out)
+        if sentence := _replaced_fit(out, task):
+            report.line(sentence)
+        names = problem.space.names, problem.noise.names
+        return Checkpoint(out, key_of(task.config.hash, task.data_hash, *names))
+
+    fit, problem, optimum = fitted(task, report, begin)
     report.stage("writing")
     written = (*save(fit, out), "run.json", "config.toml")
     write_run(task, fit.trust, data, out, time.monotonic() - began)
@@ -119,7 +118,7 @@ def identify(
         each = {p.path: asdict(p) for p in result}
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written = (*written, "profile.json")
-    kept.remove(f"{CHECKPOINT}.npz")
+    (out / f"{CHECKPOINT}.npz").unlink(missing_ok=True)
     return IdentifyResult(fit, task, tuple(result), written)
 
 
@@ -158,6 +157,28 @@ def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
     for finding in found:
         if finding.severity != "note":
             report.line(f"{finding.severity}: {finding}")
+
+
+def fitted(
+    task: FitTask,
+    report: Reporter,
+    begin: Callable[[Problem], Checkpoint | None] = lambda _: None,
+) -> tuple[Fit, Problem, Optimum]:
+    """Return the fit of a task, and its problem and optimum without runs over several floors.
+
+    The kinematics are calibrated first, and the force balance is fitted from there.
+
+    Args:
+        task: the fit task.
+        report: reporter of the progress.
+        begin: called with the problem before it is optimised; it returns the checkpoint from which
+            the fit continues, and in which every round is saved, or None.
+    """
+    kinematic = calibrated(task, report)
+    task = task.started_from(kinematic.calibration)
+    problem = task.problem()
+    problem, optimum = optimised(task, problem, begin(problem), report)
+    return summarised(task, problem, optimum, report, kinematic), problem, optimum
 
 
 def optimised(
@@ -250,7 +271,9 @@ def summarised(
         fit = _with_mixed_runs(fit, task, problem, optimum, report)
     report.stage("predicting held-out runs")
     contact = contact_errors(task.dataset, problem, optimum)
-    selection = selected(task.dataset, {**kinematic.errors, "contact": contact})
+    selection = selected(
+        task.dataset, {**kinematic.errors, "contact": contact}, kinematic.contradicted
+    )
     fit = replace(
         fit,
         calibration=kinematic.calibration,

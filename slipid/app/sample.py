@@ -51,6 +51,7 @@ def sample(
     _refuse_mixed(fit)
     folder = _log_folder(out, data)
     task = read_fit_task(read_config(out / "config.toml"), folder, report)
+    task = replace(task, choices=fit.choices)  # those of the calibration are not in the config
     _refuse_other_logs(fit, task)
     report.stage("compiling")
     fit = replace(fit, problem=task.problem(fit.robot), data=task.dataset)

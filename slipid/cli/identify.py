@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, flag, guarded, option
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, NoForceBalance
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def identify(
     exit code is 1 if the selected models are not to be trusted: on held-out runs, a simpler model
     predicts better.
     """
-    from slipid.app.config import BenchMotors, read_config
+    from slipid.app.config import BenchMotors, SteeredDrive, read_config
     from slipid.report.estimates import show_fit, show_trust
     from slipid.support.files import read_json
 
@@ -49,10 +49,15 @@ def identify(
         return bench(wanted, data, out, profile or (), json, quiet)
     if only not in (None, "calibration"):
         raise DataError(f"--only {only}: no such part; expected calibration")
-    if only:
+    if only or isinstance(wanted.content.robot, SteeredDrive):
         return calibration(config, data, out, anyway, json, quiet)
-    with Reporter(quiet=quiet) as report:
-        done = run(config, data, out, report, profile or (), anyway)
+    try:
+        with Reporter(quiet=quiet) as report:
+            done = run(config, data, out, report, profile or (), anyway)
+    except NoForceBalance as error:
+        with Reporter(quiet=quiet) as report:
+            report.line(f"calibration alone: {error}")
+        return calibration(config, data, out, anyway, json, quiet)
     content = read_json(out / "identified.json", "a result of `slipid identify`")
 
     def show(page: "Page") -> None:
@@ -69,6 +74,7 @@ def calibration(
     """Calibrate a robot's kinematics alone, write and print the result, return the exit code."""
     from slipid.app.calibrate import calibrate_only
     from slipid.app.identify import checked_task
+    from slipid.app.problem import NO_BALANCE
     from slipid.deploy.deploy import ROBOT, calibrated_robot
     from slipid.report.estimates import show_calibration, show_trust
     from slipid.support.files import read_json
@@ -77,14 +83,19 @@ def calibration(
         task = checked_task(config, data, report, anyway)
         done = calibrate_only(task, data, out, report)
         models = {floor: one.model for floor, one in done.selection.items()}
-        calibrated_robot(done.calibration, task.robot, models, task.dataset).save(out / ROBOT)
+        written = done.written
+        if task.robot.geometry.driven is None:
+            calibrated_robot(done.calibration, task.robot, models, task.dataset).save(out / ROBOT)
+            written = (*written, ROBOT)
+        else:
+            report.line(f"{NO_BALANCE}; no {ROBOT} yet")
     content = read_json(out / "identified.json", "a result of `slipid identify`")
 
     def show(page: "Page") -> None:
         show_calibration(page, done.calibration)
         show_trust(page, done.trust)
 
-    emit(json, content, show, out, (*done.written, ROBOT))
+    emit(json, content, show, out, written)
     return 1 if done.trust.is_bad else 0
 
 

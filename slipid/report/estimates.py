@@ -103,7 +103,8 @@ def show_calibration(page: Page, found: Calibration) -> None:
     for floor, (radius, base) in found.multipliers.items():
         each = " ".join(f"{r:.4f}" for r in radius)
         page.line(
-            f"multipliers of the config's lengths on {floor}: radius {each}, track {base:.4f}"
+            f"multipliers of the config's lengths on {floor}: radius {each}, "
+            f"{found.length} {base:.4f}"
         )
 
 
@@ -119,18 +120,24 @@ def calibration_table(found: Calibration) -> Table:
         made.add_row(Text(name), f"{factor * value.value:.5g}", unit, ends, verdict(value.verdict))
 
     for floor, radii in found.radius.items():
+        sides: Iterable[object]
         sides = ("left", "right") if len(radii) == 2 else range(1, len(radii) + 1)
+        sides, radii = (("of all drives",), radii[:1]) if found.steering else (sides, radii)
         for side, value in zip(sides, radii, strict=True):
             row(f"{floor}: rolling radius {side}", value)
-        row(f"{floor}: effective {'base' if found.sideways else 'track'}", found.base[floor])
+        row(f"{floor}: effective {found.length}", found.base[floor])
         if floor in found.centre:
             row(f"{floor}: centre of rotation ahead", found.centre[floor])
+    for name in [name for name in found.steering if name != "wheelbase_m"]:
+        row(f"steering: {name.removesuffix('_rad')}", found.steering[name])
     row("pose sensor ahead", found.offset[0])
     row("pose sensor to the left", found.offset[1])
     row("pose sensor yaw", found.yaw)
     row("pose lag", found.lag)
     if found.scale.verdict != "fixed":
         row("true over logged length", found.scale)
+    for name, number in found.gyro.items():
+        row(name.removesuffix("_rad_s").replace("_", " "), number)
     return made
 
 

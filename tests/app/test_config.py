@@ -107,7 +107,7 @@ def test_other_drives(tmp_path, section, wheels, grips):
         (
             'drive = "omni"\n',
             "",
-            ["robot.drive: missing", "omni, mecanum, skid, differential, general"],
+            ["robot.drive: missing", "omni, mecanum, skid, differential, steered, general"],
         ),
         ("gear_ratio = 16", "gear_ratio = -16", ["robot.gear_ratio: -16", "greater than 0"]),
         ("gear_ratio = 16", 'gear_ratio = "16:1"', ["robot.gear_ratio: '16:1'", "number"]),

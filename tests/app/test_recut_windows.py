@@ -1,6 +1,6 @@
 """Windows are cut again where the fitted lag differs from the lag they were cut at."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -67,19 +67,23 @@ def test_a_fit_goes_on_with_windows_at_the_lag_it_found(task, monkeypatch):
     assert again.windows.lag == pytest.approx(0.12)
 
 
-def test_chains_are_of_windows_as_the_fit_has_cut_them(monkeypatch, tmp_path):
+def test_chains_are_of_windows_and_choices_as_the_fit_has_them(monkeypatch, tmp_path):
     class Asked(Exception):
-        """What the problem was to be near."""
+        """What the problem was to be near, and its choices."""
 
+    @dataclass
     class Job:
-        def problem(self, near):
-            raise Asked(near)
+        choices: str
 
-    fit = SimpleNamespace(robot="the robot of the fit")
+        def problem(self, near):
+            raise Asked(near, self.choices)
+
+    fit = SimpleNamespace(robot="the robot of the fit", choices="those of its calibration, too")
     nothing = ("_refuse_mixed", "_log_folder", "_refuse_other_logs", "read_config")
     for name in nothing:
         monkeypatch.setattr(sample, name, lambda *_: None)
     monkeypatch.setattr(sample, "load", lambda _: fit)
-    monkeypatch.setattr(sample, "read_fit_task", lambda *_: Job())
-    with Reporter(quiet=True) as report, pytest.raises(Asked, match="the robot of the fit"):
+    monkeypatch.setattr(sample, "read_fit_task", lambda *_: Job("those of the config"))
+    with Reporter(quiet=True) as report, pytest.raises(Asked) as asked:
         sample.sample(tmp_path, None, sample.Plan(), 1, report)
+    assert asked.value.args == (fit.robot, fit.choices)

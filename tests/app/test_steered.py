@@ -9,6 +9,7 @@ import pytest
 
 from slipid.app.config import parsed, read_config
 from slipid.app.problem import read_fit_task
+from slipid.fitting.calibration import Calibration
 from slipid.parameter import as_numbers
 from slipid.predict.kinematics import Calibrated, nominal
 from slipid.predict.open_loop import replay_windows, tracks_from_increments
@@ -16,6 +17,7 @@ from slipid.predict.slip_models import FloorModels
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import write
+from tests.benchmarks.every_robot.fits import covered
 from tests.benchmarks.every_robot.robots import ROBOTS
 from tests.helpers.shared import invoke
 
@@ -147,6 +149,25 @@ def test_steered_kinematics_predict_windows(car):
     assert path_errors(task, FloorModels(nominal(shape)), CAR.lag).min() > 0.02
     late = path_errors(task, calibrated, CAR.lag + 0.2)  # wheels and steering of another time
     assert late.mean() > 2 * path_errors(task, calibrated, CAR.lag).mean()
+
+
+def test_identify_calibrates_alone_and_says_so(car, tmp_path):
+    out = tmp_path / "out"
+    done = invoke("identify", car / "robot.toml", "--data", car / "logs", "--out", out)
+    assert done.exit_code == 0, done.stderr
+    assert "no force balance for steered wheels" in done.stderr
+    assert "asphalt: effective wheelbase" in done.stdout
+    content = json.loads((out / "identified.json").read_text(encoding="utf-8"))
+    assert any("no force balance for steered wheels" in text for text in content["messages"])
+    assert content["selected_model"] == {"asphalt": "calibrated"}
+    inside = covered(CAR, content["calibration"])
+    assert {"base asphalt", "steering gain", "steering zero_rad", "steering understeer"} <= set(
+        inside
+    )
+    assert sum(inside.values()) >= len(inside) - 2, inside
+    found = Calibration.of_json(content["calibration"])
+    assert json.loads(json.dumps(found.to_json())) == content["calibration"]
+    assert "straight ahead at 0.8" in str(found)
 
 
 def test_what_needs_a_force_balance_says_that_there_is_none(car, tmp_path):

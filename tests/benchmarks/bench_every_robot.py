@@ -135,12 +135,11 @@ def line(records: list[dict]) -> str:
 
 
 def behind(records: list[dict]) -> str | None:
-    """Return why slipid is behind the rivals, or None; also where it cannot read the config yet."""
-    if not NAMED[records[0]["robot"]].readable:
-        return None
+    """Return why slipid is behind the rivals, or None."""
     rows = mean_rows(records)
     best = min(rows["nominal"], rows["squares"])
-    deployed = rows.get("selected", rows.get("contact" if FITS else "numbers"))
+    has_balance = NAMED[records[0]["robot"]].drive != "steered"
+    deployed = rows.get("selected", rows.get("contact" if FITS and has_balance else "numbers"))
     if deployed is None:
         return f"{records[0]['robot']}: no answer ({records[0]['verdict'].partition(':')[0]})"
     if deployed > 1.1 * best + 0.05:

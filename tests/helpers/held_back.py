@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from slipid.app.config import read_config
-from slipid.app.identify import optimised, summarised
+from slipid.app.identify import fitted
 from slipid.app.problem import ConfigFitTask, fit_task, read_fit_task
 from slipid.data.runs import Runs
 from slipid.predict.validation import Validation
@@ -12,15 +12,14 @@ from slipid.support.progress import Reporter
 
 
 def held_back(
-    config: Path, folder: Path, fitted: tuple[str, ...], judged: tuple[str, ...]
+    config: Path, folder: Path, learnt: tuple[str, ...], judged: tuple[str, ...]
 ) -> Validation:
     """Fitted to runs that have one of some words in their names, judged on those with others."""
     with Reporter(quiet=True) as report:
         read = read_config(config)
         whole: ConfigFitTask = read_fit_task(read, folder, report)
-        job = fit_task(read, part(whole.dataset, fitted), (), report)
-        problem, optimum = optimised(job, job.problem(), None, report)
-        fit = summarised(job, problem, optimum, report)
+        job = fit_task(read, part(whole.dataset, learnt), (), report)
+        fit, _, _ = fitted(job, report)
     assert fit.converged, fit.reason
     other = part(whole.dataset, judged)
     # a session that was not fitted has the marker where the robot has it

@@ -95,8 +95,9 @@ def test_a_file_beside_may_be_called_after_the_run(tmp_path):
 
 def test_a_whole_pose_beside_replaces_a_heading_in_the_file_of_the_wheels(tmp_path):
     si = plain()
-    table(tmp_path / "run1.csv", {n: si[n] for n in ("t", "left_vel", "right_vel", "yaw")})
-    table(tmp_path / "run1_pose.csv", {n: si[n] for n in ("t", "x", "y", "yaw")})
+    folder = tmp_path / "sand"
+    table(folder / "run1.csv", {n: si[n] for n in ("t", "left_vel", "right_vel", "yaw")})
+    table(folder / "run1_pose.csv", {n: si[n] for n in ("t", "x", "y", "yaw")})
     _, config = proposed(tmp_path, **ROBOT)
     layout = layout_in(config)
     assert not [name for name in layout["columns"] if name.startswith("pose_")]

@@ -44,8 +44,6 @@ class Answer:
 
 def calibration(robot: MadeRobot, folder: Path) -> dict | str:
     """Section `calibration` of identified.json, made without the rest of a fit, or why not."""
-    if not robot.readable:
-        return "config not readable yet"
     try:
         with Reporter(quiet=True) as report:
             task = read_fit_task(read_config(folder / "robot.toml"), folder / "logs", report)
@@ -62,6 +60,8 @@ def kinematics(content: dict) -> Kinematics:
     centre = dict.fromkeys(floors, 0.0)
     centre |= {floor: of["value"] for floor, of in content["centre_of_rotation_m"].items()}
     x, y = (of["value"] for of in content["pose_offset_m"])
+    straight = {"zero_rad": {"value": 0.0}, "gain": {"value": 1.0}, "understeer": {"value": 0.0}}
+    steering = content.get("steering", straight)
     return Kinematics(
         {f: np.array([r["value"] for r in of["rolling_radius_m"]]) for f, of in floors.items()},
         {f: of[length]["value"] for f, of in floors.items()},
@@ -69,6 +69,8 @@ def kinematics(content: dict) -> Kinematics:
         (x, y),
         content["pose_yaw_rad"]["value"],
         content["pose_lag_s"]["value"],
+        (steering["zero_rad"]["value"], steering["gain"]["value"]),
+        dict.fromkeys(floors, steering["understeer"]["value"]),
     )
 
 
@@ -117,9 +119,7 @@ def covered(robot: MadeRobot, calibration: dict) -> dict[str, bool]:
             stated[f"radius {floor} {j + 1}"] = radius
         for key in {"effective_track_m", "effective_base_m"} & of.keys():
             stated[f"base {floor}"] = of[key]
-    if "steering" in calibration:
-        for floor in robot.floors:
-            stated.setdefault(f"base {floor.name}", calibration["steering"]["wheelbase_m"])
+    stated |= {f"steering {key}": of for key, of in calibration.get("steering", {}).items()}
     truth, found = true(robot), {}
     for name, number in numbers(robot).items():
         if stated.get(name, {}).get("interval90") is not None:

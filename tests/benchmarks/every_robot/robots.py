@@ -124,11 +124,6 @@ class MadeRobot:
     mass: float = 10.0
 
     @property
-    def readable(self) -> bool:
-        """Whether `slipid identify` fits the robot at all; it refuses steered robots yet."""
-        return self.drive != "steered"
-
-    @property
     def drives(self) -> int:
         return len(self.floors[0].radius)
 

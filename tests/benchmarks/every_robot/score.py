@@ -81,6 +81,10 @@ def numbers(robot: MadeRobot) -> dict[str, Number]:
     if scaled and turns:
         found["place x"] = lambda k: k.place[0] - k.centre[firm]
         found["place y"] = lambda k: k.place[1]
+    if robot.drive == "steered":
+        found["steering zero_rad"] = lambda k: k.steering[0]
+        found["steering gain"] = lambda k: k.steering[1]
+        found["steering understeer"] = lambda k: k.understeer[firm]
     if scaled or turns:
         found["lag"] = lambda k: k.lag
     return found
