@@ -91,7 +91,8 @@ def remarks(
         )
     elif straight:
         out.append(f"on {', '.join(straight)} no run turns: the effective {what} is not identified")
-    if any(v.verdict in ("weak", "not_identified") for v in c.radius[c.firmest]):
+    unseen = any(v.verdict in ("weak", "not_identified") for v in c.radius[c.firmest])
+    if unseen and not _is_absurd(_mean_radius(c) / c.nominal_radius):
         out.append(
             "the runs tell ratios of lengths, and little of the mean wheel radius: drive some "
             "metres straight ahead with known positions at both ends"

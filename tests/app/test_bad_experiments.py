@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from slipid.app.calibrate import calibrated, remarks
-from slipid.app.check import sanity
+from slipid.app.check import calibration_part, overview, sanity
 from slipid.app.config import read_config
 from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.predict.selection import selected
@@ -21,6 +21,8 @@ from tests.benchmarks.every_robot.robots import ROBOTS, MadeRobot
 from tests.helpers.shared import invoke
 
 Columns = dict[str, np.ndarray]
+ROWS = 600
+"""Rows of every run, equal so that all calibrations share what is compiled."""
 NAMED = {robot.name: robot for robot in ROBOTS}
 SQUARES = replace(NAMED["diff_umbmark"], runs=2)
 """Two wheels on squares, both ways, at one speed."""
@@ -35,7 +37,7 @@ STEERED = replace(NAMED["bicycle_zero"], runs=2)
 def tables(robot: MadeRobot) -> list[Columns]:
     rng = np.random.default_rng(0)
     runs = [driven(robot, robot.floors[0], commands(robot, rng, k, False), rng) for k in range(2)]
-    return [table(robot, run, rng) for run in runs]
+    return [{k: v[:ROWS] for k, v in table(robot, run, rng).items()} for run in runs]
 
 
 def write(
@@ -71,7 +73,8 @@ def judged(robot: MadeRobot, radius: float = 1.0):
     """A calibration of sound runs with its remarks."""
     task = task_of(robot, radius=radius)
     found = calibrated(task, Reporter(quiet=True))
-    return found.calibration, "\n".join(remarks(found, selected(task.dataset, found.errors), task))
+    selection = selected(task.dataset, found.errors, found.contradicted)
+    return found.calibration, "\n".join(remarks(found, selection, task))
 
 
 def still(columns: Columns, run: int, which: tuple[int, ...] = (0, 1)) -> Columns:
@@ -80,7 +83,7 @@ def still(columns: Columns, run: int, which: tuple[int, ...] = (0, 1)) -> Column
 
 
 def one_heading(columns: Columns, run: int) -> Columns:
-    return columns | {"heading": np.full_like(columns["heading"], 0.3)}
+    return columns | {"heading": np.full_like(columns["heading"], columns["heading"][0])}
 
 
 def one_heading_first(columns: Columns, run: int) -> Columns:
@@ -92,6 +95,12 @@ def test_wheels_that_never_turn_are_named_with_their_channel():
     assert found.kind == "no_motion"
     assert re.search(r"no wheel turns in these runs, although the poses move by up to \d", str(found))
     assert "the channel wheel_ticks names the columns" in str(found)
+
+
+def test_a_run_whose_wheels_do_not_count_is_named():
+    (found,) = alarms(task_of(SQUARES, lambda columns, run: still(columns, run, (1,))))
+    assert (found.kind, found.runs) == ("no_motion", ("floor/1.csv",))
+    assert "no wheel turns in 1 of 2 runs, although the poses move" in found.found
 
 
 def test_a_robot_at_rest_is_not_said_to_move():
@@ -150,16 +159,17 @@ def test_a_wrong_radius_alone_is_calibrated():
     calibration, said = judged(MIXED, 1.5)
     assert calibration.radius["floor"][0].value == pytest.approx(0.05, rel=5e-3)
     assert calibration.radius["floor"][0].verdict == "identified"
-    assert "the wheel radius in the config is 75 mm; on floor it is 50" in said
+    assert "the wheel radius in the config is 75 mm; on floor it is 49.98 mm" in said
 
 
 def test_lengths_far_from_the_config_do_not_count_as_identified():
     calibration, said = judged(MIXED, 4.0)
     assert {v.verdict for v in calibration.radius["floor"]} == {"not_identified"}
-    assert "the wheel radius comes out 0.25 times as large as in the config" in said
+    assert re.search("the wheel radius comes out 0.2[0-9]* times as large as in the config", said)
     assert "the wheel radius in the config is" not in said
 
 
+@pytest.mark.slow
 def test_one_run_is_said_to_be_one():
     assert "on floor one run alone" in judged(replace(SQUARES, runs=1))[1]
     assert "one run alone" not in judged(MIXED)[1]
@@ -174,7 +184,7 @@ def test_without_turns_the_track_is_not_identified():
 
 
 def test_one_speed_is_said_with_what_it_does_not_tell():
-    said = judged(replace(SQUARES, runs=1))[1]
+    said = judged(SQUARES)[1]
     assert "one speed alone on floor (0.2 m/s): whether slip grows with speed" in said
     assert "nearly one number" not in said
     assert "one speed" not in judged(MIXED)[1]
@@ -185,13 +195,11 @@ def test_one_speed_without_headings_mixes_lag_and_place():
     assert "the lag of the poses and the place of their sensor ahead are nearly one number" in said
 
 
-def test_check_shows_no_calibration_of_exchanged_wheels(tmp_path):
-    file = write(tmp_path, SQUARES, radius=1.5, order=(1, 0))
-    result = invoke("check", file, "--data", tmp_path / "logs", "--quiet")
-    assert result.exit_code == 1
-    assert result.stdout.startswith("wrong: left and right seem to be exchanged")
-    assert "no calibration before the findings marked wrong are corrected" in result.stdout
-    assert "rolling radius" not in result.stdout
+def test_check_does_not_calibrate_exchanged_wheels():
+    task = task_of(SQUARES, radius=1.5, order=(1, 0))
+    same, part = calibration_part(task, overview(task)["findings"], Reporter(quiet=True))
+    assert same is task
+    assert part == {"suspects": ["no calibration before the findings marked wrong are corrected"]}
 
 
 def test_identify_refuses_wheels_that_never_turn(tmp_path):

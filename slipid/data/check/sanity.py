@@ -113,11 +113,12 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
         geometry: declared geometry of the robot.
         mass_kg: mass of the robot [kg], or None if it is unknown.
     """
-    if still := tuple(_no_motion(data, float(geometry.wheel_radius))):
+    still = tuple(_no_motion(data, float(geometry.wheel_radius)))
+    if still and not still[0].runs:
         return still
     if geometry.driven is not None:
-        return worst_first(steered_findings(data, geometry))
-    found = tuple(_all(data, geometry, mass_kg))
+        return worst_first([*still, *steered_findings(data, geometry)])
+    found = (*still, *_all(data, geometry, mass_kg))
     if not {finding.kind for finding in found} & {*MADE_REDUNDANT_BY}:
         columns = tuple(misordered(data.logs))
         found = tuple(f for f in found if not columns or f.kind not in CAUSED_BY_ORDER) + columns
@@ -125,24 +126,33 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
 
 
 def _no_motion(runs: Runs, radius: float) -> Iterator[Finding]:
-    """Yield the finding that no wheel turns in any run; `radius` is that of the wheels [m]."""
-    turned = max(np.ptp(log.wheel_angle, axis=0).max(initial=0.0) for log in runs.logs)
-    if turned >= STILL_RAD or radius * turned >= MOVED_M:
-        return
-    moved = 0.0
-    for run in range(len(runs)):
+    """Yield the finding that no wheel turns in any run, or in runs whose poses move.
+
+    `radius` is that of the wheels [m].
+    """
+    turned = np.array([np.ptp(log.wheel_angle, axis=0).max(initial=0.0) for log in runs.logs])
+    still = (turned < STILL_RAD) & (radius * turned < MOVED_M)
+    moved = np.zeros(len(runs))
+    for run in np.flatnonzero(still).tolist():
         place = runs.pose[runs.rows(run), :2]
         place = place[np.isfinite(place).all(axis=1)]
-        moved = max(moved, float(np.hypot(*np.ptp(place, axis=0))) if len(place) else 0.0)
-    poses = f"although the poses move by up to {moved:.2g} m" if moved > MOVED_M else ""
-    angles = f"change by {turned:.2g} rad at most" if turned > 0 else "are constant"
+        moved[run] = np.hypot(*np.ptp(place, axis=0)) if len(place) else 0.0
+    every = bool(still.all())
+    if not every:
+        still &= moved > LEAST_PATH_M
+    if not still.any():
+        return
+    names = () if every else tuple(runs.logs[k].name for k in np.flatnonzero(still))
+    most = float(moved[still].max())
+    poses = f", although the poses move by up to {most:.2g} m" if most > MOVED_M else ""
+    where = "these runs" if every else f"{len(names)} of {len(runs)} runs"
     channel = runs.logs[0].wheel_reading.channel or "of the wheels"
     yield Finding(
         "no_motion",
-        f"no wheel turns in these runs{', ' if poses else ''}{poses}: the angles of the wheels "
-        f"{angles}",
+        f"no wheel turns in {where}{poses}",
         f"check that the channel {channel} names the columns of the encoders and that these count, "
-        "or log runs in which the robot drives",
+        + ("or log runs in which the robot drives" if every else "or exclude these runs"),
+        runs=names,
     )
 
 
@@ -376,15 +386,17 @@ def agreement(
 ) -> RunAgreement:
     """Return the agreement of poses with wheels in every run, under an interpretation."""
     convention = meant.convention
+    # Not shifted by the lag of the poses, which cannot be told from a constant heading.
+    turned = increments(data, at, 0.0).wheels @ to_body(evidence, meant)[2] / evidence.base
+    wheels_rad, poses_rad = (
+        np.array([_range(of[at.run == k]) for k in range(len(data.names))])
+        for of in (turned, at.pose_after[:, 2] - at.pose_before[:, 2])
+    )
     body = body_motion(at, convention.bare) * [1.0, 1.0, evidence.base]
     body = body @ rotation(-convention.offset).T
     predicted = moved.wheels @ to_body(evidence, meant).T
     known = usable(body, predicted)
     body, predicted, run = body[known], predicted[known], at.run[known]
-    wheels_rad, poses_rad = (
-        np.array([_range(of[run == k, 2] / evidence.base) for k in range(len(data.names))])
-        for of in (predicted, body)
-    )
     length = np.linalg.norm(body, axis=1)
     most = LONGEST_RATIO * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
     body = body * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
@@ -413,7 +425,7 @@ def agreement(
 
 def _range(increments: Float[np.ndarray, " step"]) -> float:
     """Return the range of the sum of increments, 0 if there are none."""
-    return float(np.ptp(np.cumsum(increments))) if len(increments) else 0.0
+    return float(np.ptp(np.nancumsum(increments))) if len(increments) else 0.0
 
 
 def _heading_constant(data: JoinedRuns, compared: RunAgreement) -> Finding:
