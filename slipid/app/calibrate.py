@@ -69,6 +69,11 @@ def remarks(found: KinematicFit, selection: Mapping[str, FloorSelection]) -> tup
         )
     elif straight:
         out.append(f"on {', '.join(straight)} no run turns: the effective {what} is not identified")
+    if any(v.verdict in ("weak", "not_identified") for v in c.radius[c.firmest]):
+        out.append(
+            "the runs tell ratios of lengths, and little of the mean wheel radius: drive some "
+            "metres straight ahead with known positions at both ends"
+        )
     for floor, one in selection.items():
         if one.runs == 1:
             out.append(f"on {floor} one run alone: intervals come from its parts; drive several")
@@ -113,7 +118,7 @@ def calibrate_only(
     """
     began = time.monotonic()
     found = calibrated(task, report)
-    selection = selected(task.dataset, found.errors)
+    selection = selected(task.dataset, found.errors, found.contradicted)
     trust = verdict_of_trust(selection, notes=remarks(found, selection))
     writable(out)
     runs = [log.name for log in task.logs]

@@ -204,7 +204,7 @@ def calibration_part(task: Task, report: Reporter) -> tuple[Task, Content]:
         found = calibrated(task, report)
     except DataError as error:  # no run has poses while its wheels turn
         return task, {"suspects": [f"no calibration: {error}"]}
-    suspects = remarks(found, selected(task.dataset, found.errors))
+    suspects = remarks(found, selected(task.dataset, found.errors, found.contradicted))
     content = {"calibration": found.calibration.to_json(), "suspects": list(suspects)}
     return task.started_from(found.calibration), content
 

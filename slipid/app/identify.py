@@ -82,6 +82,7 @@ def identify(
             reported.
 
     Raises:
+        NoForceBalance: the robot's wheels or the poses allow a calibration only.
         DataError: config or logs are wrong; in this case nothing was written.
     """
     began = time.monotonic()
@@ -270,7 +271,9 @@ def summarised(
         fit = _with_mixed_runs(fit, task, problem, optimum, report)
     report.stage("predicting held-out runs")
     contact = contact_errors(task.dataset, problem, optimum)
-    selection = selected(task.dataset, {**kinematic.errors, "contact": contact})
+    selection = selected(
+        task.dataset, {**kinematic.errors, "contact": contact}, kinematic.contradicted
+    )
     fit = replace(
         fit,
         calibration=kinematic.calibration,

@@ -7,7 +7,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from slipid.app.config import Config, LogsSection, geometry
+from slipid.app.config import BenchMotors, Config, LogsSection, geometry
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.end_poses import EndPoses, read_end_poses, refuse_unused
@@ -171,7 +171,9 @@ def layout_of(config: Config, section: LogsSection) -> AnyLayout:
     """Return the layout that a log section names: one in the config, else a preset."""
     own = config.content.layouts
     if section.format in own:
-        where, declared = f"{config.path} layouts.{section.format}", own[section.format]
+        where, declared = f"{config.path} layouts.{section.format}", dict(own[section.format])
+        if not isinstance(config.content.robot, BenchMotors):
+            declared.setdefault("wheel_radius", config.content.robot.wheel_radius_m)
         kind = declared.get("kind", "rows")
         if kind == "bag":
             return declared_bag_layout(declared, where, config.path.parent)

@@ -31,7 +31,7 @@ from slipid.data.check.columns import refuse_misordered
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
-from slipid.data.windows import Windows, steady_duration, windows
+from slipid.data.windows import Windows, require_whole_poses, steady_duration, windows
 from slipid.fitting.calibration import Calibration
 from slipid.fitting.problem import Problem, fixed_viscosities
 from slipid.infer.bench.motor import BenchRoot
@@ -40,7 +40,7 @@ from slipid.model.kinematics import is_axle
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
-from slipid.support.errors import DataError, did_you_mean
+from slipid.support.errors import DataError, NoForceBalance, did_you_mean
 from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
 
@@ -129,6 +129,12 @@ class FitTask:
     mixed: tuple[tuple[Runs, FloorMap], ...] = ()
     user_choices: int = 0
 
+    def require_force_balance(self) -> None:
+        """Raise `NoForceBalance` if none can be fitted to the robot's wheels or its runs."""
+        refuse_steered(self.robot.geometry)
+        for run in range(len(self.dataset)):
+            require_whole_poses(self.dataset, run)
+
     @cached_property
     def longest_window(self) -> float:
         """Longest duration of a window [s]: the one set, or as long as the wheels are steady."""
@@ -212,9 +218,9 @@ NO_BALANCE = (
 
 
 def refuse_steered(shape: Geometry) -> None:
-    """Raise `DataError` if a wheel is steered, which no force balance describes."""
+    """Raise `NoForceBalance` if a wheel is steered, which no force balance describes."""
     if shape.driven is not None:
-        raise DataError(NO_BALANCE)
+        raise NoForceBalance(NO_BALANCE)
 
 
 def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask:

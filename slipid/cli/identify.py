@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, flag, guarded, option
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, NoForceBalance
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -51,8 +51,13 @@ def identify(
         raise DataError(f"--only {only}: no such part; expected calibration")
     if only or isinstance(wanted.content.robot, SteeredDrive):
         return calibration(config, data, out, anyway, json, quiet)
-    with Reporter(quiet=quiet) as report:
-        done = run(config, data, out, report, profile or (), anyway)
+    try:
+        with Reporter(quiet=quiet) as report:
+            done = run(config, data, out, report, profile or (), anyway)
+    except NoForceBalance as error:
+        with Reporter(quiet=quiet) as report:
+            report.line(f"calibration alone: {error}")
+        return calibration(config, data, out, anyway, json, quiet)
     content = read_json(out / "identified.json", "a result of `slipid identify`")
 
     def show(page: "Page") -> None:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.data.runs import Runs, first_row
 from slipid.data.wheel_signals import interpolate
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, NoForceBalance
 
 NORMAL_STD = 0.6827
 """Probability that a normally distributed variable is within one std of its mean [1]."""
@@ -210,7 +210,7 @@ def _edges(
     """
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
-    _require_whole_poses(data, run)
+    require_whole_poses(data, run)
     shown = time[fresh] - lag
     fresh = fresh[(fresh >= first) & (shown >= time[0] - 1e-9) & (shown <= time[-1] + 1e-9)]
     if len(fresh) < per_segment + 1:
@@ -231,14 +231,14 @@ def _edges(
     return [rows[k : k + per_segment + 1] for k in range(0, count, per_segment)]
 
 
-def _require_whole_poses(data: Runs, run: int) -> None:
-    """Raise `DataError` if poses of a run lack a coordinate, or if there are at most two."""
+def require_whole_poses(data: Runs, run: int) -> None:
+    """Raise `NoForceBalance` if poses of a run lack a coordinate, or if there are at most two."""
     pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
     lacking = np.isnan(pose).any(axis=0)
     what = "without headings" if lacking[2] else "without positions" if lacking.any() else ""
     if not what and len(pose) > 2:
         return
-    raise DataError(
+    raise NoForceBalance(
         f"{data.logs[run].name}: poses {what or f'in {len(pose)} rows only'}; expected x, y and "
         "heading during the run, which a fit of motors and contact needs. Kinematics alone can be "
         "calibrated: slipid identify --only calibration"

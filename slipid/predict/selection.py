@@ -3,7 +3,9 @@
 The models stand in order of size: the lengths of the config (`nominal`), calibrated kinematics
 (`calibrated`), and the force balance (`contact`). On each floor the simplest one is selected whose
 mean error on held-out runs is within one standard error of the smallest; the standard error is that
-of the difference, paired run by run and clustered by sectors of the direction of travel.
+of the difference, paired run by run and clustered by sectors of the direction of travel. The
+config's lengths are selected only where the calibration does not contradict them: a few runs cannot
+show by their errors what other paths would.
 
 Runs are held out in folds: in sectors of the commanded direction if every floor was driven in at
 least `LEAST_SECTORS` of them, else in groups of runs. The models without a fold follow from the
@@ -19,25 +21,29 @@ Breiman et al. 1984, Classification and Regression Trees; folds by one Newton st
 2017, NeurIPS.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.data.runs import Runs
+from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration import Calibration, cross_calibrated
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
 from slipid.model.geometry import Geometry
+from slipid.model.kinematics import nominal_base
+from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.folds import fold_keys, sectors
 from slipid.predict.kinematics import Calibrated, nominal
 from slipid.predict.predictive import force_balance_of
 from slipid.predict.score import clusters, mean_error
-from slipid.predict.slip_model import turned
+from slipid.predict.slip_model import RobotSpec, RunSignals, path_of, turned
 from slipid.predict.slip_models import FloorModels
+from slipid.predict.steps import Steps, TwistModel
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
 
@@ -46,6 +52,8 @@ LEAST_SECTORS, MOST_GROUPS = 4, 6
 groups of runs otherwise."""
 MOST_RUNS = 48
 """Largest number of held-out runs that are predicted on a floor, picked evenly."""
+CONTRADICTION = 2.6
+"""Distance of a length of the config from the calibrated one that contradicts it [std]."""
 OUTLIER_RATIO = 3.0
 """A run is suspected to be on another floor if its error exceeds the floor's median error, and the
 error as if it were on the other floor, by more than this factor [1]."""
@@ -62,8 +70,9 @@ class FloorSelection:
     Attributes:
         model: the selected model.
         errors: mean error of held-out runs over their path length, keyed by model [1].
-        behind: mean difference to the best model's error, and its standard error, keyed by model
-            [1]; the standard error is nan with fewer than two clusters.
+        behind: mean difference to the error of the best model that may be selected, and the
+            standard error of this difference, keyed by model [1]; the latter is nan with fewer than
+            two clusters.
         runs: number of predicted runs.
         held_out: True if the runs were predicted by models that were not fitted to them.
     """
@@ -125,6 +134,20 @@ class KinematicFit:
     errors: Errors
     suspects: tuple[str, ...]
 
+    @property
+    def contradicted(self) -> frozenset[str]:
+        """Floors on which the calibration contradicts a length of the config."""
+        c = self.calibration
+        return frozenset(
+            floor
+            for floor in c.radius
+            for value, given in (
+                *((radius, c.nominal_radius) for radius in c.radius[floor]),
+                (c.base[floor], c.nominal_base),
+            )
+            if abs(value.value - given) > CONTRADICTION * value.std
+        )
+
 
 def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> KinematicFit:
     """Return the calibration of runs, and errors of `nominal` and `calibrated` on held-out runs.
@@ -140,7 +163,13 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
     for k, runs in _picked(data, fold).items():
         calibration = without.get(k, whole)
         seen, own = calibration.seen(robot), calibrated_model(calibration, robot.geometry)
-        for w in replay.replay_windows(data.subset(runs), seen):
+        whole_poses = np.array([_has_whole_poses(data, run) for run in runs.tolist()])
+        for run in runs[~whole_poses].tolist():
+            floor = data.logs[run].surface or "unknown"
+            errors["nominal"][run] = aligned_error(data, run, plain.model, seen)
+            errors["calibrated"][run] = aligned_error(data, run, own.fitted[floor], seen)
+        runs = runs[whole_poses]
+        for w in replay.replay_windows(data.subset(runs), seen) if len(runs) else ():
             cases = {"nominal": (plain, w), "calibrated": (own, w)}
             if len(floors) > 1:
                 cases |= {f: (own, replace(w, surface=(f,) * len(w))) for f in floors}
@@ -149,6 +178,62 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
                 errors[name][runs[tracks.run]] = path_errors(tracks)
     kept = {name: errors[name] for name in MODELS[:2]}
     return KinematicFit(whole, kept, tuple(_mislabelled(data, errors, floors)))
+
+
+def _has_whole_poses(data: Runs, run: int) -> bool:
+    """Return whether a run has enough poses with all coordinates to be predicted in steps."""
+    pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
+    return len(pose) > 2 and bool(np.isfinite(pose).all())
+
+
+PARTS_OF_GAP, LONGEST_PART_S = 4, 0.2
+"""Least number and longest duration of the steps in which the motion between two poses is computed
+for an aligned path."""
+
+
+def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float:
+    """Return the error over the path length of a run whose poses lack coordinates.
+
+    The start of such a run is not known. The whole predicted path of the pose sensor is therefore
+    aligned with the measured positions, by a rotation and a translation (Procrustes), and the error
+    is the root mean square of what remains. If the poses are those of the ends and the first one is
+    whole, the path begins at it, and the error is that of the end. Headings alone are aligned by
+    their mean, and an error of 1 rad counts as half the track or base.
+
+    Args:
+        data: the runs.
+        run: index of the run.
+        model: fitted slip model of the run's floor.
+        seen: robot with the calibrated pose sensor.
+    """
+    rows, lag, spec = data.rows(run), float(seen.camera.lag), RobotSpec.of(seen)
+    time, pose = data.time[rows], data.pose[rows]
+    shown = data.fresh[rows] & np.isfinite(pose).any(axis=1)
+    shown &= (time - lag >= time[0] - 1e-9) & (time - lag <= time[-1] + 1e-9)
+    pose, at = pose[shown], time[shown] - lag
+    parts = np.maximum(PARTS_OF_GAP, np.ceil(np.diff(at) / LONGEST_PART_S)).astype(int)
+    index = np.concatenate([[0], np.cumsum(parts)])
+    edges = np.interp(np.arange(index[-1] + 1), index, at)
+    turn = np.diff(interpolate(time, data.turned(run), edges), axis=0)
+    signals = RunSignals(data.logs[run].name, np.diff(edges), turn)
+    path = path_of(model.twist(Steps(signals, np.zeros(1, int)), spec), signals.dt)
+    length = max(float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()), 1e-9)
+    path = path[index]
+    offset = np.broadcast_to(np.asarray(seen.camera.marker_place), (len(path), 2))
+    known = np.isfinite(pose[:, :2]).all(axis=1)
+    if known.sum() < 2:
+        off = path[:, 2] - pose[:, 2]
+        return 0.5 * nominal_base(seen.geometry) * float(np.nanstd(off)) / length
+    found, measured = (
+        (x[known, 0] + 1j * x[known, 1]) for x in (path[:, :2] + turned(path[:, 2], offset), pose)
+    )
+    if len(pose) == 2 and np.isfinite(pose[0]).all():
+        found, measured = np.diff(found), np.diff(measured) * float(seen.camera.scale)
+        heading = pose[0, 2] - float(seen.camera.marker_yaw) - path[0, 2]
+        return float(np.abs(found * np.exp(1j * heading) - measured)[0]) / length
+    found, measured = found - found.mean(), (measured - measured.mean()) * float(seen.camera.scale)
+    turn_by = np.exp(1j * np.angle(np.vdot(found, measured)))
+    return float(np.sqrt(np.mean(np.abs(found * turn_by - measured) ** 2))) / length
 
 
 def _mislabelled(data: Runs, errors: Errors, floors: Sequence[str]) -> Iterator[str]:
@@ -194,8 +279,16 @@ def contact_errors(data: Runs, problem: Problem, optimum: Optimum) -> Float[np.n
     return out
 
 
-def selected(data: Runs, errors: Errors) -> dict[str, FloorSelection]:
-    """Return the selection on every floor from the errors of all models, simplest model first."""
+def selected(
+    data: Runs, errors: Errors, contradicted: Collection[str]
+) -> dict[str, FloorSelection]:
+    """Return the selection on every floor.
+
+    Args:
+        data: the runs.
+        errors: errors of all models, simplest model first.
+        contradicted: floors on which the calibration contradicts the lengths of the config.
+    """
     floor = np.array([log.surface or "unknown" for log in data.logs])
     fold, cluster = selection_folds(data), clusters(np.degrees(data.heading).tolist())
     out = {}
@@ -204,12 +297,13 @@ def selected(data: Runs, errors: Errors) -> dict[str, FloorSelection]:
         seen = np.all([np.isfinite(x) for x in each.values()], axis=0)
         each = {m: x[seen] for m, x in each.items()}
         mean = {m: float(x.mean()) for m, x in each.items()}
-        best = min(mean, key=lambda m: mean[m])
+        able = [m for m in mean if m != "nominal" or name not in contradicted]
+        best = min(able, key=lambda m: mean[m])
         behind = {}
         for m, x in each.items():
             _, _, se = mean_error(x - each[best], cluster[floor == name][seen])
             behind[m] = (mean[m] - mean[best], float(se))
-        chosen = next(m for m, (gap, se) in behind.items() if m == best or gap <= se)
+        chosen = next(m for m in able if m == best or behind[m][0] <= behind[m][1])
         held_out = bool((fold[floor == name] >= 0).all())
         out[name] = FloorSelection(chosen, mean, behind, int(seen.sum()), held_out)
     return out

@@ -1,5 +1,7 @@
 """Runs without a pose sensor are calibrated from a table of end poses, measured by hand."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import write
 from tests.benchmarks.every_robot.robots import ROBOTS
+from tests.helpers.shared import invoke
 
 UMBMARK = next(robot for robot in ROBOTS if robot.name == "diff_umbmark")
 """Wheels that differ by 2 %, and a track that is 6 % wider than its user says, on squares."""
@@ -123,3 +126,17 @@ def test_a_radius_that_is_given_makes_the_track_of_squares_sharp(squares):
     assert low < 0.170 < high
     assert high - low < 0.04  # from .14 if the radius is free
     assert found.base["floor"].verdict == "identified"
+
+
+def test_identify_calibrates_such_runs_and_predicts_their_ends(squares, tmp_path):
+    folder, lines = squares
+    task_of(folder, lines)
+    words = ("--data", folder / "logs", "--out", tmp_path, "--only", "calibration")
+    done = invoke("identify", folder / "robot.toml", *words, "--quiet")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads((tmp_path / "identified.json").read_text())
+    assert found["selected_model"] == {"floor": "calibrated"}
+    errors = found["trust"]["held_out_error_over_path"]["floor"]
+    assert errors["nominal"] > 0.03
+    assert errors["calibrated"] < 0.004
+    assert "little of the mean wheel radius: drive some metres" in " ".join(done.stdout.split())

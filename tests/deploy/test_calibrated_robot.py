@@ -70,3 +70,22 @@ def test_another_part_than_the_calibration_is_refused(calibrated):
     )
     assert done.exit_code == 2
     assert "--only slip: no such part; expected calibration" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["diff_positions", "diff_heading"])
+def test_runs_without_whole_poses_are_calibrated_alone(name, tmp_path):
+    """A full fit needs whole poses, so that it calibrates alone, and says so."""
+    robot = next(robot for robot in ROBOTS if robot.name == name)
+    write(robot, tmp_path, seed=2)
+    done = invoke(
+        *("identify", tmp_path / "robot.toml", "--data", tmp_path / "logs"),
+        *("--out", tmp_path / "out"),
+    )
+    assert done.exit_code == 0
+    assert "calibration alone: " in done.stderr
+    content = json.loads((tmp_path / "out" / "identified.json").read_text())
+    floor = robot.floors[0].name
+    assert content["selected_model"] == {floor: "calibrated"}
+    low, high = content["calibration"]["surfaces"][floor]["effective_track_m"]["interval90"]
+    assert low < robot.floors[0].base < high
+    assert DeployedRobot.load(tmp_path / "out" / "robot.json").calibrated == (True,)

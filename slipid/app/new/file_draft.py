@@ -30,7 +30,7 @@ from slipid.app.new.units import (
     usual_step,
     usual_unit,
 )
-from slipid.data.reading.units import factor
+from slipid.data.reading.units import converts, factor
 
 ASK_EFFORT = "what is it: a current (unit A), a torque (N*m), a voltage (V) or a duty (1)?"
 _ASK_COLUMNS = "which column holds what? There are: {}"
@@ -136,7 +136,7 @@ def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
     The remark is empty if the main file has no speeds that can be compared with the ticks.
     """
     speed = run.main.find(*reversed(SPEEDS))
-    if speed is None or not speed.unit or run.main.clock is None:
+    if speed is None or not converts(speed.unit, "rad/s") or run.main.clock is None:
         return ""
     time, rates = run.main.time, np.nan_to_num(speed.values) * factor(speed.unit, "rad/s")
     if len(speed.columns) != len(ticks.columns):
@@ -155,7 +155,7 @@ def radius_hint(run: RunStudy, robot: RobotAnswers) -> dict[str, str]:
     if ratio is None or speed is None or len(speed.columns) > 2:
         return {}
     unit = speed.unit or unit_of(run.main, speed, run, robot).unit
-    radius = ratio / factor(unit, "rad/s")
+    radius = ratio / factor(unit, "rad/s") if converts(unit, "rad/s") else 0.0
     if not RADII[0] <= radius <= RADII[1]:
         return {}
     ask = f"default value: measure it; according to the poses it is about {radius:.2g}"

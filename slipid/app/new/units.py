@@ -135,7 +135,7 @@ def speed_unit(ratio: float | None, radius: float | None) -> UnitGuess:
             ratio for motor speeds; None if unknown.
         radius: wheel radius [m], or None if it is unknown.
     """
-    options = "rad/s, rpm or deg/s; or m/s at the rim: then divide by the radius with scale"
+    options = "rad/s, rpm or deg/s; or m/s at the rim"
     if ratio is None:
         return UnitGuess("rad/s", doubt=f"in which unit: {options}?")
     if radius is not None:
@@ -147,8 +147,7 @@ def speed_unit(ratio: float | None, radius: float | None) -> UnitGuess:
     elif RADII[0] <= ratio <= RADII[1]:
         return UnitGuess("rad/s", f"as fast as the pose with wheels of about {ratio:.2g} m")
     if 0.7 < ratio < 1.5:
-        doubt = "as fast as the pose itself, hence m/s at the rim: put scale = 1 / wheel radius"
-        return UnitGuess("rad/s", doubt=doubt)
+        return UnitGuess("m/s", doubt="as fast as the pose itself: is it m/s at the rim?")
     if RADII[0] <= ratio / factor("rpm", "rad/s") <= RADII[1]:
         return UnitGuess("rpm", doubt="rpm, or deg/s? With rad/s wheels would be too small")
     return UnitGuess("rad/s", doubt=f"in which unit: {options}?")

@@ -56,6 +56,8 @@ GROUPS = {
     "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
 }
 """Groups of channels that one message contains, keyed by the group's name in a bag layout."""
+AT_RIM = {"wheel_angle": "m", "wheel_speed": "m/s", "wheel_speed_command": "m/s"}
+"""Channels of wheels that may be logged as lengths at the rim, and SI units of these lengths."""
 TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
 """Channels from which the turns of the wheels can be computed; the first available one is used."""
 
@@ -113,6 +115,8 @@ class SensorLayout:
         torque_constant: torque of the *motor* per current [N m/A], by which logged torques become
             currents. Without it, a fit compares torques with those of its contact and friction, and
             fits nothing electric.
+        wheel_radius: radius by which travels and speeds of wheels at the rim are divided, if their
+            unit is one of length [m]; by default that of the robot in the config.
         max_gap: longest allowed time between two samples of a wheel [s]; a log with a longer gap is
             an error.
         max_pose_jump: longest allowed distance between two successive poses [m]; a run with a
@@ -127,9 +131,28 @@ class SensorLayout:
     tick_bits: Count = 32
     current_is_signed: StrictBool = True
     torque_constant: Positive | None = None
+    wheel_radius: Positive | None = None
     max_gap: Positive = 1.0
     max_pose_jump: Positive = 0.5
     max_heading_jump: Positive = 1.6
+
+    def factor(self, channel: str, unit: str) -> float:
+        """Return the factor from a unit to the SI unit of a channel.
+
+        Raises:
+            ValueError: the unit cannot be converted, or needs `wheel_radius`, which is not given.
+        """
+        if channel not in AT_RIM or not converts(unit, AT_RIM[channel]):
+            return factor(unit, CHANNELS[channel])
+        if self.wheel_radius is None:
+            raise ValueError(f"{channel} is in '{unit}', but wheel_radius [m] is not given")
+        return factor(unit, AT_RIM[channel]) / self.wheel_radius
+
+    def note(self, channel: str, unit: str) -> list[str]:
+        """Return a note about a channel that was divided by the wheel radius."""
+        if channel not in AT_RIM or not converts(unit, AT_RIM[channel]):
+            return []
+        return [f"{channel} in {unit} was divided by a wheel radius of {self.wheel_radius:g} m"]
 
     def lacks(self, channels: Collection[str]) -> str | None:
         """Return a message about a missing channel or setting that some channels need, or None.
@@ -209,13 +232,13 @@ class Layout(SensorLayout):
         Raises:
             ValueError: the unit cannot be converted, or `metres_per_pixel` is needed and not given.
         """
-        unit, target = self.channels[channel].unit, CHANNELS[channel]
+        unit = self.channels[channel].unit
         if channel in ("pose_x", "pose_y") and converts(unit, "pixel"):
             if self.metres_per_pixel is None:
                 raise ValueError(f"{channel} is in '{unit}', but metres_per_pixel is not given")
             scale = self.metres_per_pixel[0 if channel == "pose_x" else 1]
             return factor(unit, "pixel") * scale
-        return factor(unit, target)
+        return self.factor(channel, unit)
 
 
 def unknown(what: str, name: object, choices: Iterable[str]) -> str:

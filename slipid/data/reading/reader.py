@@ -263,6 +263,7 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
             notes.append(
                 f"column '{columns[j]}' has empty cells: it is used at the times of its values"
             )
+        notes += layout.note(name, channel.unit)
         if name == "wheel_ticks":
             cells = cumulative_ticks(cells, layout, notes)
         values = (cells * channel.scale + channel.offset) * layout.to_si(name)

@@ -101,6 +101,10 @@ def test_speeds_in_rpm_or_at_the_rim_are_not_taken_for_others(tmp_path):
         table(tmp_path / "rim" / "run.csv", rim), **{**ROBOT, "wheel_radius_m": "0.1"}
     )
     assert any("m/s at the rim" in question for question in config.questions)
+    log = read(config, tmp_path / "rim").logs[0]
+    np.testing.assert_allclose(
+        log.wheel_angle[-1], motion(log.time)[0][-1] * RADIUS / 0.1, rtol=0.01
+    )
 
 
 @pytest.mark.parametrize("increments", [False, True])

@@ -207,6 +207,25 @@ def test_generic_csv(root):
 
 
 @pytest.mark.parametrize(
+    ("channel", "unit", "scale"), [("wheel_angle", "mm", 50.0), ("wheel_speed", "m/s", 0.05)]
+)
+def test_travel_and_speed_of_rims_are_divided_by_the_radius(root, channel, unit, scale):
+    """A column of rpm stands for speeds of wheels here, and one of ticks for their angles."""
+    names = ["left", "right"] if channel == "wheel_angle" else ["left_rpm", "right_rpm"]
+    columns = {k: v for k, v in GENERIC_LAYOUT["columns"].items() if k.startswith(("time", "pose"))}
+    at_rim = columns | {channel: {"columns": names, "unit": unit, "scale": scale}}
+    turned = columns | {channel: {"columns": names, "unit": "rad/s" if "s" in unit else "rad"}}
+    layouts = [{"columns": at_rim, "wheel_radius": 0.05}, {"columns": turned}]
+    found, expected = (read_log(root / GENERIC, declared_layout(one, "layout")) for one in layouts)
+    np.testing.assert_allclose(found.wheel_angle, expected.wheel_angle, rtol=1e-9)
+    assert f"{channel} in {unit} was divided by a wheel radius of 0.05 m" in found.notes
+    with pytest.raises(
+        DataError, match=rf"columns.{channel}: {channel} is in '{unit}', but wheel_"
+    ):
+        declared_layout({"columns": at_rim}, "layout")
+
+
+@pytest.mark.parametrize(
     ("absent", "lacking"), [(["pose_heading"], [2]), (["pose_x", "pose_y"], [0, 1])]
 )
 def test_poses_may_lack_headings_or_positions(root, absent, lacking):

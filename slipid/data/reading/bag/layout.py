@@ -18,7 +18,6 @@ from slipid.data.reading.layout import (
     several,
     unknown,
 )
-from slipid.data.reading.units import factor
 from slipid.support.errors import DataError
 from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
 
@@ -151,14 +150,14 @@ def declared_bag_layout(
     definitions = layout.definitions and folder / layout.definitions
     layout = replace(layout, definitions=definitions)
     for name, channel in layout.topics.items():
-        if problem := _channel_problem(name, channel):
+        if problem := _channel_problem(name, channel, layout):
             raise DataError(f"{where} topics.{name}: {problem}")
     if problem := _problem(layout):
         raise DataError(f"{where}: {problem}")
     return layout
 
 
-def _channel_problem(name: str, channel: TopicChannel) -> str | None:
+def _channel_problem(name: str, channel: TopicChannel, layout: BagLayout) -> str | None:
     """Return a message about a contradiction in the settings of one channel, or None."""
     if name not in _NAMES:
         return unknown("channel", name, _NAMES)
@@ -179,7 +178,7 @@ def _channel_problem(name: str, channel: TopicChannel) -> str | None:
         return f"effort without a unit, which differs between drivers; expected unit = {EFFORT}"
     if channel.unit is not None:
         try:
-            factor(channel.unit, CHANNELS[name])
+            layout.factor(name, channel.unit)
         except ValueError as error:
             return str(error)
     return None

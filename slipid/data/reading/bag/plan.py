@@ -12,7 +12,7 @@ from slipid.data.reading.bag.opened import BagTopic, OpenBag
 from slipid.data.reading.bag.shape import without_indices
 from slipid.data.reading.bag.streams import FieldPick, JointPick, Pick, TransformPick, edges_of
 from slipid.data.reading.bag.transforms import STATIC, ChainLink, chain_of
-from slipid.data.reading.layout import CHANNELS, GROUPS, PER_WHEEL
+from slipid.data.reading.layout import AT_RIM, CHANNELS, GROUPS, PER_WHEEL
 from slipid.data.reading.units import converts, factor
 from slipid.support.errors import DataError, bad_data, did_you_mean, first_names
 
@@ -290,6 +290,8 @@ def _joint_pick(
 
 def _check_unit(channel: str, path: str, unit: str, topic: BagTopic) -> None:
     """Raise `DataError` if the unit of a field cannot be converted to that of the channel."""
+    if channel in AT_RIM and converts(unit, AT_RIM[channel]):
+        return
     try:
         factor(unit, CHANNELS[channel])
     except ValueError as error:

@@ -14,9 +14,8 @@ from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.plan import ChannelPlan
 from slipid.data.reading.bag.streams import Edge, JointPick, Stream, TransformPick
 from slipid.data.reading.bag.transforms import STATIC, TransformSeries, composed, heading, tilt
-from slipid.data.reading.layout import CHANNELS, GROUPS, PER_WHEEL
+from slipid.data.reading.layout import GROUPS, PER_WHEEL
 from slipid.data.reading.signal import Signal, SignalSource, cumulative_ticks, first_true
-from slipid.data.reading.units import factor
 from slipid.support.errors import bad_data, did_you_mean, first_names
 
 NOTED_DIFFERENCE_S = 0.5
@@ -235,7 +234,8 @@ def channel_signal(
     if plan.channel not in PER_WHEEL and columns != 1:
         found = f"{columns} numbers for {plan.channel}"
         raise samples.source.error(found, "one number; select it by its index, such as [0]")
-    values = (samples.values * scale + plan.spec.offset) * factor(plan.unit, CHANNELS[plan.channel])
+    notes += layout.note(plan.channel, plan.unit)
+    values = (samples.values * scale + plan.spec.offset) * layout.factor(plan.channel, plan.unit)
     return Signal(samples.time, values, samples.source)
 
 

@@ -1,0 +1,77 @@
+"""Selection of a slip model by held-out runs: the rule itself, on made errors."""
+
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from slipid.predict.open_loop import Tracks
+from slipid.predict.selection import path_errors, selected, selection_folds
+
+
+def runs(floors, heading_deg=None):
+    logs = [SimpleNamespace(surface=f, load="as_built", name=str(k)) for k, f in enumerate(floors)]
+    heading = np.full(len(floors), np.nan) if heading_deg is None else np.radians(heading_deg)
+    return SimpleNamespace(logs=logs, heading=heading, speed=np.full(len(floors), np.nan))
+
+
+def errors(**means):
+    """Errors of twelve runs with the given means, which differ from run to run alike."""
+    common = np.linspace(-0.2, 0.2, 12)
+    own = np.random.default_rng(0).normal(0.0, 0.03, (len(means), 12))
+    return {m: x * (1 + common + noise) for (m, x), noise in zip(means.items(), own, strict=True)}
+
+
+@pytest.mark.parametrize(
+    ("means", "contradicted", "model"),
+    [
+        ({"nominal": 0.01, "calibrated": 0.01, "contact": 0.01}, (), "nominal"),
+        ({"nominal": 0.01, "calibrated": 0.01, "contact": 0.01}, ("a",), "calibrated"),
+        ({"nominal": 0.05, "calibrated": 0.01, "contact": 0.00999}, (), "calibrated"),
+        ({"nominal": 0.05, "calibrated": 0.02, "contact": 0.01}, (), "contact"),
+        ({"nominal": 0.01, "calibrated": 0.03, "contact": 0.04}, (), "nominal"),
+        ({"nominal": 0.05, "calibrated": 0.02}, (), "calibrated"),
+    ],
+)
+def test_the_simplest_within_a_standard_error_of_the_best_is_selected(means, contradicted, model):
+    found = selected(runs("a" * 12), errors(**means), contradicted)["a"]
+    assert found.model == model
+    assert found.held_out
+    assert found.runs == 12
+    assert found.errors == pytest.approx(means, rel=0.05)
+
+
+def test_runs_without_an_error_are_not_counted():
+    made = errors(nominal=0.05, calibrated=0.01)
+    made["calibrated"][3:] = np.nan
+    assert selected(runs("a" * 12), made, ())["a"].runs == 3
+
+
+def test_the_only_run_of_a_floor_is_not_held_out():
+    data = runs(["a"] * 5 + ["b"])
+    np.testing.assert_array_equal(selection_folds(data), [0, 1, 2, 3, 4, -1])
+    made = {m: x[:6] for m, x in errors(nominal=0.05, calibrated=0.01).items()}
+    found = selected(data, made, ())
+    assert (found["a"].held_out, found["b"].held_out) == (True, False)
+
+
+def test_sectors_are_held_out_where_every_floor_was_driven_in_enough_of_them():
+    heading = np.tile([10.0, 70.0, 130.0, 190.0], 2)
+    np.testing.assert_array_equal(selection_folds(runs("a" * 8, heading)), [0, 1, 2, 3] * 2)
+
+
+def square(side):
+    """A square with rounded-off time: poses along its sides, back at the start."""
+    corner = side * np.array([0, 1, 1 + 1j, 1j, 0])
+    place = np.concatenate([np.linspace(a, b, 9)[:-1] for a, b in itertools.pairwise(corner)])
+    place = np.append(place, 0)
+    heading = np.append(np.repeat(np.arange(4) * np.pi / 2, 8), 2 * np.pi)
+    return np.stack([place.real, place.imag, heading], -1)
+
+
+def test_a_closed_path_does_not_hide_a_wrong_scale():
+    """Its end is right, but its parts are not: 5 % of scale are 5 % of their chords."""
+    tracks = Tracks(np.zeros(1, int), square(1.05)[None], square(1.0)[None])
+    assert np.hypot(*tracks.gap[0, :2]) < 1e-12
+    assert 0.015 < path_errors(tracks)[0] < 0.05
