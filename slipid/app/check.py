@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,6 +16,7 @@ from slipid.data.align.clock import Clock
 from slipid.data.check.findings import Finding, worst_first
 from slipid.data.check.sanity import findings
 from slipid.data.runs import Runs, channels
+from slipid.fitting.calibration import evenly
 from slipid.fitting.problem import CREEPS, Problem
 from slipid.fitting.variances import Search
 from slipid.infer import slip_curves as curves_of
@@ -30,6 +31,8 @@ from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
+MOST_CALIBRATED = 64
+"""Largest number of runs that a check calibrates."""
 Task = TypeVar("Task", bound=FitTask)
 _AT_MOTOR = ("wheel_ticks", "motor_angle", "motor_speed", "motor_speed_command")
 """Channels at the motor shaft, which the gear ratio of a layout converts to motion of the wheel."""
@@ -199,12 +202,20 @@ def check(
 
 
 def calibration_part(task: Task, report: Reporter) -> tuple[Task, Content]:
-    """Return the task started from its calibration, and the part of check.json about it."""
+    """Return the task started from its calibration, and the part of check.json about it.
+
+    Of many runs, `MOST_CALIBRATED` are calibrated; `slipid identify` calibrates all.
+    """
+    data = task.dataset
+    if len(data) > MOST_CALIBRATED:
+        some = evenly([log.surface or "unknown" for log in data.logs], MOST_CALIBRATED)
+        data = data.subset(some)
+        report.line(f"calibrated from {len(data)} of {len(task.dataset)} runs")
     try:
-        found = calibrated(task, report)
+        found = calibrated(replace(task, dataset=data), report)
     except DataError as error:  # no run has poses while its wheels turn
         return task, {"suspects": [f"no calibration: {error}"]}
-    suspects = remarks(found, selected(task.dataset, found.errors, found.contradicted))
+    suspects = remarks(found, selected(data, found.errors, found.contradicted))
     content = {"calibration": found.calibration.to_json(), "suspects": list(suspects)}
     return task.started_from(found.calibration), content
 

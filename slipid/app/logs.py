@@ -1,6 +1,7 @@
 """Reading of the logs that a config names, as one set of runs; also access to packaged files."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from zipfile import ZipFile
@@ -8,6 +9,7 @@ from zipfile import ZipFile
 import numpy as np
 
 from slipid.app.config import BenchMotors, Config, LogsSection, geometry
+from slipid.data.gyro_heading import with_gyro_heading
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.end_poses import EndPoses, read_end_poses, refuse_unused
@@ -62,11 +64,14 @@ def read_dataset(
                     short += 1
                     continue
                 seen.append(log.name)
+                log = _with_wheels(config, log)
                 if section.end_poses is not None:
                     if log.name not in table:
                         aside.append(f"set aside: {log.name}: no row in {section.end_poses}")
                         continue
                     log = _with_ends(config, log, table[log.name])
+                elif log.pose is None and log.gyro is not None and log.wheels:
+                    log = with_gyro_heading(log)
                 if log.name in sessions:
                     raise DataError(
                         f"{log.name}: found by two globs of {config.path}; expected it once"
@@ -83,6 +88,25 @@ def read_dataset(
         nothing = f"{root}: no run in any file of {config.path}; expected logs with a moving robot"
         raise DataError("\n".join([*aside, *skipped]) or nothing)
     return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
+
+
+def _with_wheels(config: Config, log: Log) -> Log:
+    """Return a log without wheels with the wheel angles that roll its travel without slip.
+
+    A calibration of these wheels gives multipliers of the config's lengths, which should be those
+    by which the robot computed its odometry. A log without reported travel is returned as it is.
+    """
+    if log.wheels or log.travel is None:
+        return log
+    shape = geometry(config.content.wheels)
+    if shape.driven is not None:
+        raise DataError(
+            f"{log.path}: a twist is logged, but no wheel; expected wheel and steering angles of a "
+            "robot that steers"
+        )
+    angle = log.travel @ np.asarray(shape.forward()).T / float(shape.wheel_radius)
+    note = "wheel angles follow from the reported twist and the lengths of the config"
+    return replace(log, wheel_angle=angle, travel=None, notes=(*log.notes, note))
 
 
 def _with_ends(config: Config, log: Log, ends: EndPoses) -> Log:

@@ -48,6 +48,8 @@ class Log:
         wheel_reading: what the angles were computed from.
         wheel_speed: reported speed of each wheel [rad/s], or None.
         wheel_speed_command: commanded speed of each wheel [rad/s], or None.
+        travel: integrals of the twist that the robot's odometry reports, ahead [m], to the left [m]
+            and in yaw [rad], if no motion of wheels is logged; else None.
         twist_command: commanded x [m/s], y [m/s] and yaw rate [rad/s], or None.
         current: current of each motor [A], or None; torque of each drive at the wheel [N m] if
             `current_is_torque`.
@@ -82,6 +84,7 @@ class Log:
     wheel_reading: WheelReading = WheelReading()
     wheel_speed: Float[np.ndarray, "time wheel"] | None = None
     wheel_speed_command: Float[np.ndarray, "time wheel"] | None = None
+    travel: Float[np.ndarray, "time 3"] | None = None
     twist_command: Float[np.ndarray, "time 3"] | None = None
     current: Float[np.ndarray, "time wheel"] | None = None
     current_fresh: Bool[np.ndarray, "time wheel"] | None = None

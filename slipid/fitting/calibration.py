@@ -41,6 +41,7 @@ from scipy.stats import t as student
 
 from slipid.data.align.lag import pose_lag
 from slipid.data.runs import Runs
+from slipid.fitting.gyro import LEAST_PARTS, gyro_errors
 from slipid.fitting.innovations import (
     Motion,
     PoseTracks,
@@ -76,6 +77,8 @@ and of that on other floors over it [1], of the steering's zero [rad], of its ga
 understeer [s^2/m], of which soft tyres have .03."""
 LAG_STD, YAW_STD, SESSION_STD = 0.3, 0.5, 0.02
 """Prior stds of the lag [s], of the sensor's yaw and of its deviation in a session [rad]."""
+GYRO_PRIORS = {"gyro_scale": (1.0, 0.05, "1"), "gyro_bias_rad_s": (0.0, 0.02, "rad/s")}
+"""Prior mean, prior std and unit of the true over the measured yaw rate, and of the gyro's bias."""
 LOOSE_SCALE_STD = 0.01
 """Relative prior std of the scale of positions above which the radius stays at the config's, since
 motion determines only their ratio."""
@@ -157,6 +160,8 @@ class Calibration:
         scale: true over logged length [1].
         firmest: floor with the largest radius, to which the centre and other radii refer.
         steering: numbers of a robot that steers, keyed as in identified.json; empty for others.
+        gyro: scale and bias of the gyro, keyed as in identified.json; empty if no run has both a
+            gyro and headings.
         nominal_radius, nominal_base: lengths of the config [m].
         noise: stds of poses and motion.
         runs: number of calibrated runs.
@@ -173,6 +178,7 @@ class Calibration:
     scale: Value
     firmest: str
     steering: Mapping[str, Value]
+    gyro: Mapping[str, Value]
     nominal_radius: float
     nominal_base: float
     noise: MotionNoise
@@ -292,6 +298,7 @@ class Calibration:
             "pose_session_yaw_rad": dict(self.session_yaw),
             "pose_lag_s": asdict(self.lag),
             "pose_scale": asdict(self.scale),
+            **{name: asdict(number) for name, number in self.gyro.items()},
             **({"steering": steering} if steering else {}),
             "multipliers": {
                 floor: {"wheel_radius": list(radius), "track": base}
@@ -329,6 +336,7 @@ class Calibration:
             scale=value(content["pose_scale"]),
             firmest=content["firmest"],
             steering={name: value(v) for name, v in steering.items()},
+            gyro={name: value(content[name]) for name in GYRO_PRIORS if name in content},
             nominal_radius=content["nominal"]["wheel_radius_m"],
             nominal_base=content["nominal"][length],
             noise=MotionNoise(
@@ -669,7 +677,7 @@ class _Fit:
     def with_noise(self) -> "_Fit":
         """Return the fit with variances of largest posterior, from some of the tracks."""
         floor = self.floor[: len(self.tracks.run)]
-        part = self.of_tracks(_evenly(floor, NOISE_TRACKS * len(np.unique(floor))))
+        part = self.of_tracks(evenly(floor, NOISE_TRACKS * len(np.unique(floor))))
         typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:], len(self.model.floors))])
         numbers = part.motion(self.z)
 
@@ -756,7 +764,7 @@ def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
     if len(data) <= MOST_START:
         return _rounds(fit, choices)
     # Many runs only refine what a part of them has found.
-    some = _evenly([log.surface or "unknown" for log in data.logs], MOST_START)
+    some = evenly([log.surface or "unknown" for log in data.logs], MOST_START)
     part = _rounds(_cut(replace(fit, runs=some)), choices)
     return _rounds(_cut(replace(part, runs=None)), choices)
 
@@ -778,7 +786,7 @@ def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
     return fit
 
 
-def _evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
+def evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
     """Return indices of at most about `most` elements, evenly from each floor."""
     label = np.asarray(floors)
     some, names = [], np.unique(label)
@@ -917,11 +925,31 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         scale=value(["scale"], "1"),
         firmest=model.floors[model.firmest],
         steering={} if shape.driven is None else steering,
+        gyro={} if rough else _gyro(fit.data, float(model.column("lag", z))),
         nominal_radius=radius,
         nominal_base=base,
         noise=_noise(fit),
         runs=len(fit.data),
     )
+
+
+def _gyro(data: Runs, lag: float) -> dict[str, Value]:
+    """Return scale and bias of the gyro; at their priors if headings change too little."""
+    found = gyro_errors(data, lag)
+    if found is None:
+        return {}
+    known = all(
+        std < WEAK * prior
+        for std, (_, prior, _) in zip(found[1], GYRO_PRIORS.values(), strict=True)
+    )
+    out = {}
+    for (name, (mean, prior, unit)), at, std in zip(GYRO_PRIORS.items(), *found, strict=True):
+        verdict: Verdict = "identified" if std < IDENTIFIED * prior else "weak"
+        best, std, verdict = (at, std, verdict) if known else (mean, prior, "not_identified")
+        half = float(std * student.ppf(0.95, LEAST_PARTS - 1))
+        ends = float(best) - half, float(best) + half
+        out[name] = Value(float(best), ends, float(std), verdict, unit)
+    return out
 
 
 def _noise(fit: _Fit) -> MotionNoise:

@@ -109,8 +109,8 @@ def pose_tracks(
     kept = [k for k, some in picked.items() if len(some) > 1]
     if not kept:
         raise DataError(
-            f"{data.logs[0].name}: no two poses with wheel angles at the same time, in this run "
-            "and in all others"
+            f"{data.logs[0].name}: no two different poses during the record of the wheels, in "
+            "this run and in all others; expected runs in which the robot drives and has poses"
         )
     count, tracks = _size(max(len(rows[k]) for k in kept) - 1), _size(len(kept))
     time = np.zeros((tracks, count + 1))

@@ -20,7 +20,7 @@ MODEL_NAMES = {
     "identified": "identified (force balance)",
     "nominal": "encoders, sizes as in the config",
     "encoder": "encoders, sizes as fitted",
-    "constant": "constant slip",
+    "calibrated": "calibrated kinematics",
     "linear": "slip ~ torque",
     "affine": "slip ~ 1 + torque",
     "svr": "slip ~ 1 + torque, SVR",

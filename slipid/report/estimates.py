@@ -136,6 +136,8 @@ def calibration_table(found: Calibration) -> Table:
     row("pose lag", found.lag)
     if found.scale.verdict != "fixed":
         row("true over logged length", found.scale)
+    for name, number in found.gyro.items():
+        row(name.removesuffix("_rad_s").replace("_", " "), number)
     return made
 
 

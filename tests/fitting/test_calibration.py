@@ -112,6 +112,11 @@ def test_headings_alone_show_ratios_of_lengths(task_of):
     assert near(found.base["floor"], 0.315, 2e-3)
     assert [place.verdict for place in found.offset] == ["not_identified"] * 2
     assert found.lag.verdict == "identified"
+    for name, true in (("gyro_scale", 1.0), ("gyro_bias_rad_s", 0.003)):
+        low, high = found.gyro[name].interval90
+        assert low < true < high
+        assert found.gyro[name].verdict == "identified"
+    assert Calibration.of_json(found.to_json()).gyro == found.gyro
 
 
 def test_a_number_that_the_config_fixes_stays(task_of):

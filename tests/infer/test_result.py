@@ -326,7 +326,7 @@ def test_the_data_hash_depends_on_names_and_bytes_not_on_order():
 
 
 def test_a_saved_fit_comes_back_the_same(tmp_path):
-    fit = dataclasses.replace(fit_of(True), baselines={"constant": {"soft": [0.25]}})
+    fit = dataclasses.replace(fit_of(True), baselines={"linear": {"soft": [0.25]}})
     names = save(fit, tmp_path)
     back = load(tmp_path)
     assert identified_json(back) == identified_json(fit)
@@ -516,7 +516,7 @@ def test_damaged_results_are_refused_with_a_message(tmp_path):
     with pytest.raises(DataError, match="damaged"):
         load(tmp_path)
     (tmp_path / "fit.json").write_text('{"schema": "other/1"}')
-    with pytest.raises(DataError, match=r"its schema is other/1; expected slipid\.fit/6"):
+    with pytest.raises(DataError, match=r"its schema is other/1; expected slipid\.fit/7"):
         load(tmp_path)
     (tmp_path / "fit.json").write_text("{")
     with pytest.raises(DataError, match="not valid JSON"):

@@ -39,11 +39,12 @@ def assembled(run: RawRun, layout: SensorLayout) -> Log:
         raise bad_data(run.identity.path, found, "columns of the wheels and of the pose")
     turns = next((name for name in TURNS if name in signals), None)
     clock = clock_of(list(signals.values()))
-    if turns is not None:
-        first, last = signals[turns].time[[0, -1]]
+    odometry = turns is None and "twist_yaw" in signals
+    if (motion := "twist_yaw" if odometry else turns) is not None:
+        first, last = signals[motion].time[[0, -1]]
         inside = (clock >= first) & (clock <= last)
         clock = clock if inside.all() else clock[inside]
-        _check_gaps(signals[turns], layout)
+        _check_gaps(signals[motion], layout)
     remarks = list(run.notes)
     wheels = _of_wheels(signals, layout)
     held = {name: _held(signal, clock) for name, signal in wheels.items()}
@@ -61,6 +62,7 @@ def assembled(run: RawRun, layout: SensorLayout) -> Log:
         wheel_reading=_reading(turns, signals, layout),
         wheel_speed=held.get("wheel_speed"),
         wheel_speed_command=held.get("wheel_speed_command"),
+        travel=_travel(signals, clock) if odometry else None,
         twist_command=_twist(held, len(clock)),
         current=held.get("current"),
         current_fresh=_fresh(wheels.get("current"), clock),
@@ -215,6 +217,19 @@ def _twist(held: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
     return np.concatenate([held.get(name, np.zeros((rows, 1))) for name in names], axis=1)
 
 
+def _travel(
+    signals: Mapping[str, Signal], clock: Float[np.ndarray, " time"]
+) -> Float[np.ndarray, "time 3"]:
+    """Return the integrals of the reported twist, zero along axes that were not logged."""
+    out = np.zeros((len(clock), 3))
+    for k, name in enumerate(GROUPS["twist"]):
+        if name in signals:
+            there = ~np.isnan(signals[name].values[:, 0])
+            time, values = signals[name].time[there], signals[name].values[there]
+            out[:, k] = np.interp(clock, time, integral(time, values)[:, 0])
+    return out - out[0]
+
+
 def _pose(
     signals: Mapping[str, Signal], clock: Float[np.ndarray, " time"]
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -273,7 +288,7 @@ def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]
         )
     # The offset refers to the times of the log, which start at 0 if the robot's clock counts from
     # 1970, so the start that was subtracted is added again.
-    turns = next(name for name in TURNS if name in run.signals)
+    turns = next(name for name in (*TURNS, "twist_yaw") if name in run.signals)
     start = float(run.signals[turns].time[0] - log.time[0])
     return replace(clock, offset=clock.offset + start)
 
@@ -287,4 +302,5 @@ def _motion_pairs(
     """
     if robot.gyro is not None and not np.isnan(pose[:, 2]).any():
         yield MotionPair.of_gyro(robot.time, robot.gyro, time, pose)
-    yield MotionPair.of_wheels(robot.time, robot.wheel_angle, time, pose)
+    turned = robot.wheel_angle if robot.travel is None else robot.travel
+    yield MotionPair.of_wheels(robot.time, turned, time, pose)

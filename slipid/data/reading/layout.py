@@ -36,6 +36,9 @@ PER_WHEEL = {
 """Channels with a column for each wheel or motor, and their SI units."""
 SINGLE = {
     "time": "s",
+    "twist_x": "m/s",
+    "twist_y": "m/s",
+    "twist_yaw": "rad/s",
     "twist_command_x": "m/s",
     "twist_command_y": "m/s",
     "twist_command_yaw": "rad/s",
@@ -53,6 +56,7 @@ CHANNELS: dict[str, str] = {**SINGLE, **SEVERAL, **PER_WHEEL}
 """Every channel that a layout may name, with its SI unit."""
 GROUPS = {
     "pose": ("pose_x", "pose_y", "pose_heading"),
+    "twist": ("twist_x", "twist_y", "twist_yaw"),
     "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
 }
 """Groups of channels that one message contains, keyed by the group's name in a bag layout."""

@@ -44,6 +44,7 @@ _KNOWN: dict[str, dict[str, tuple[tuple[str, ...], str]]] = {
 without its package if several packages have a copy of it."""
 _INSIDE = {
     "pose": ("pose.pose.", "pose.", "transform.", ""),
+    "twist": ("twist.twist.", "twist.", ""),
     "twist_command": ("twist.twist.", "twist.", ""),
 }
 """Beginnings of the paths of a pose or a twist in messages."""
@@ -56,6 +57,7 @@ _FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("x", "y", "heading"),
         ("position[0]", "position[1]", "q[1]", "q[2]", "q[3]", "q[0]"),
     ),
+    "twist": (("linear.x", "linear.y", "angular.z"),),
     "twist_command": (("linear.x", "linear.y", "angular.z"),),
 }
 """Forms that a pose or a twist has in messages: names of its numbers, in order."""
@@ -65,6 +67,7 @@ _FITTING = {
     "wheel_ticks": "robotino_msgs/MotorReadings",
     "pose": "geometry_msgs/PoseStamped, PoseWithCovarianceStamped or TransformStamped, "
     "nav_msgs/Odometry, or tf2_msgs/TFMessage with frame and child",
+    "twist": "nav_msgs/Odometry, geometry_msgs/TwistStamped or Twist",
     "twist_command": "geometry_msgs/Twist or TwistStamped",
 }
 """Message types that contain each channel, for error messages."""
