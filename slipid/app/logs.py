@@ -9,6 +9,7 @@ from zipfile import ZipFile
 import numpy as np
 
 from slipid.app.config import BenchMotors, Config, LogsSection, geometry
+from slipid.data.gyro_heading import with_gyro_heading
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.end_poses import EndPoses, read_end_poses, refuse_unused
@@ -69,6 +70,8 @@ def read_dataset(
                         aside.append(f"set aside: {log.name}: no row in {section.end_poses}")
                         continue
                     log = _with_ends(config, log, table[log.name])
+                elif log.pose is None and log.gyro is not None and log.wheels:
+                    log = with_gyro_heading(log)
                 if log.name in sessions:
                     raise DataError(
                         f"{log.name}: found by two globs of {config.path}; expected it once"

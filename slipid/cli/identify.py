@@ -83,19 +83,16 @@ def calibration(
         task = checked_task(config, data, report, anyway)
         done = calibrate_only(task, data, out, report)
         models = {floor: one.model for floor, one in done.selection.items()}
-        written = done.written
-        if task.robot.geometry.driven is None:
-            calibrated_robot(done.calibration, task.robot, models, task.dataset).save(out / ROBOT)
-            written = (*written, ROBOT)
-        else:
-            report.line(f"{NO_BALANCE}; no {ROBOT} yet")
+        calibrated_robot(done.calibration, task.robot, models, task.dataset).save(out / ROBOT)
+        if task.robot.geometry.driven is not None:
+            report.line(NO_BALANCE)
     content = read_json(out / "identified.json", "a result of `slipid identify`")
 
     def show(page: "Page") -> None:
         show_calibration(page, done.calibration)
         show_trust(page, done.trust)
 
-    emit(json, content, show, out, written)
+    emit(json, content, show, out, (*done.written, ROBOT))
     return 1 if done.trust.is_bad else 0
 
 

@@ -34,6 +34,7 @@ from slipid.robot.record import (
     RecordedNumber,
     RobotRecord,
     Source,
+    SteeringRecord,
     axes_of,
     plain,
 )
@@ -48,7 +49,8 @@ ROBOT = "robot.json"
 NO_CONTROLLER = (
     "the drives of this robot cannot produce every motion ahead, sideways and in yaw: the robot "
     "has an estimator (slipid.Estimator), but no controller, so `slipid trial` and `slipid export` "
-    "are not available; identify, validate, compare, sample, selftest and design are available"
+    "are not available; identify, validate, compare, sample, selftest and design are available "
+    "(of a robot with steered wheels, identify alone)"
 )
 """Message for robots that have no controller, see `DeployedRobot.steers`."""
 DRAWS = 64
@@ -117,8 +119,9 @@ def with_kinematics(
         model = models.get(floor.name, "contact")
         if model == "contact":
             continue
-        numbers = found.numbers(floor.name) * (model == "calibrated")
-        *radius, base, centre = numbers
+        # floors share their steering, so that a robot that steers has calibrated kinematics on all
+        whole = model == "calibrated" or shape.driven is not None
+        *radius, base, centre = found.numbers(floor.name)[: shape.drives + 2] * whole
         matrix = matrices(rolling, one * np.exp(radius), np.exp(base), np.asarray(centre))
         rows = tuple(tuple(float(x) for x in row) for row in matrix)
         effect = found.noise.effect[floor.name]
@@ -127,13 +130,18 @@ def with_kinematics(
             kinematics=(rows[0], rows[1], rows[2]),
             process=found.noise.process[floor.name],
             effect=effect,
+            wheelbase=found.nominal_base * float(np.exp(base)) if shape.driven else None,
         )
         # what uncertain lengths do per metre: a radius to the distance, radii and base to the yaw
         std = max(v.std / v.value for v in found.radius[floor.name])
         of_base = found.base[floor.name].std / found.base[floor.name].value
         spread[k] = (std, 0.0, float(np.hypot(std, of_base)) / found.base[floor.name].value)
     loads = tuple(_without_effects(load, floors, spread) for load in record.loads)
-    return replace(record, floors=tuple(floors), loads=loads)
+    steering = None
+    if found.steering:
+        names = ("zero_rad", "gain", "understeer")
+        steering = SteeringRecord(*(found.steering[name].value for name in names))
+    return replace(record, floors=tuple(floors), loads=loads, steering=steering)
 
 
 def _without_effects(

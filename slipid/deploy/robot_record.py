@@ -38,6 +38,9 @@ from slipid.robot import record
 from slipid.robot.record import EffectRecord, axes_of, plain
 from slipid.support.blocks import in_blocks
 
+NO_LIMIT = 1e6
+"""Highest current of a robot whose currents are not modelled [A]."""
+
 
 def robot_record(
     robot: Robot,
@@ -71,7 +74,10 @@ def robot_record(
         parameters={p: n for p, n in numbers.items() if not p.startswith("camera.")},
         floors=tuple(_floor(name, std, seen.get(name)) for name in robot.surfaces.labels),
         loads=tuple(
-            _load(robot, name, highest_speed, draws, effects.get(name)) for name in robot.body.loads
+            _load(robot, name, highest_speed, draws, effects.get(name))
+            if robot.geometry.driven is None
+            else _without_forces(robot, name)
+            for name in robot.body.loads
         ),
         current_trend=current_trend,
         highest_speed=highest_speed,
@@ -124,6 +130,17 @@ def _load(
         told=effects,
         highest_current=float(np.abs(amps).max()),
         wheel_curve=tuple((float(a), float(b)) for a, b in curve),
+    )
+
+
+def _without_forces(robot: Robot, name: str) -> record.LoadRecord:
+    """Return the record of a load set-up of a robot that steers, which has no force balance."""
+    return record.LoadRecord(
+        name=name,
+        spread=((0.0, 0.0, 0.0),) * len(robot.surfaces.labels),
+        told=None,
+        highest_current=NO_LIMIT,
+        wheel_curve=((0.0, 0.0),) * robot.geometry.drives,
     )
 
 

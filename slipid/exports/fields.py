@@ -98,6 +98,8 @@ def fields_of(
 ) -> tuple[Field, ...]:
     """Return a field for every array in a tree of modules with documented attributes.
 
+    Attributes that are None, as of robots that steer in others, have no field.
+
     Args:
         tree: an array, or a module that contains arrays and further modules.
         documented: class whose docstring describes the attributes; by default the tree's class.
@@ -114,6 +116,8 @@ def fields_of(
                 about = docs.get(field.name, above)
                 parts += fields_of(getattr(tree, field.name), None, name, about)
         return tuple(parts)
+    if tree is None:
+        return ()
     array = jnp.asarray(tree)
     about = above if UNIT.search(above) else f"{above} {NO_UNIT}".strip()
     return (Field(prefix, kind_of(array.dtype), tuple(array.shape), about),)

@@ -473,6 +473,9 @@ class _Model:
         radius = np.array(
             [[sum(self.column(n, z) for n in _radius_names(f, j)) for j in drives] for f in floors]
         )
+        if "radius" not in self.free:
+            # The mean radius is given, so that drives deviate from it in opposite directions.
+            radius = radius - np.mean([self.column(f"drive.{j}", z) for j in drives], axis=0)
         base = [sum(self.column(n, z) for n in _base_names(f)) for f in floors]
         base = self.nominal_base * np.exp(np.stack(base, axis=-1))
         return Kinematics(

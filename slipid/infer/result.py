@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.runs import Runs
+from slipid.data.windows import Windows
 from slipid.fitting.calibration import Calibration
 from slipid.fitting.noise import POOLED
 from slipid.fitting.optimise import Optimum
@@ -29,6 +30,7 @@ from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, m
 from slipid.model.geometry import Geometry
 from slipid.model.kinematics import with_lengths
 from slipid.model.robot import Robot, Validity
+from slipid.predict.open_loop import Tracks, tracks_from_increments
 from slipid.predict.predictive import ForceBalance
 from slipid.predict.ranking import Comparison, compared
 from slipid.predict.selection import FloorSelection
@@ -213,6 +215,19 @@ class Fit:
     def seen(self) -> Robot:
         """The fitted robot with the calibrated pose sensor, by which simpler models are judged."""
         return self.robot if self.calibration is None else self.calibration.seen(self.robot)
+
+    def tracks(self, w: Windows) -> Tracks:
+        """Return tracks of whole runs, predicted by the slip model selected on each floor."""
+        whole = self.contact.tracks(w)
+        out = Tracks(whole.run, np.array(whole.predicted), np.array(whole.measured))
+        models = {m.name: m for m in restored(self.config_shape, dict(self.baselines))}
+        for name in sorted({one.model for one in self.selection.values()} - {"contact"}):
+            mine = [self.selection[floor].model == name for floor in w.surface]
+            late = w.at_lag(float(self.seen.camera.lag))
+            increments = models[name].increments(late, self.seen)
+            own = tracks_from_increments(self.seen, w, increments)
+            out.predicted[mine], out.measured[mine] = own.predicted[mine], own.measured[mine]
+        return out
 
     @cached_property
     def trust(self) -> Trust:

@@ -131,7 +131,12 @@ PATHS = "Paths by the encoders (dotted), by the fitted robot (blue)\nand by the 
 FIGURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
     "slip_by_heading": lambda fit, data, measured: heading_figure(fit.robot, measured),
     "paths": lambda fit, data, measured: path_figure(
-        fit.contact, data, measured.groups, PATHS + "runs of the fit"
+        fit.robot,
+        fit.tracks,
+        data,
+        measured.groups,
+        PATHS + "runs of the fit, predicted by the model selected on each floor",
+        {floor: one.sentence for floor, one in fit.selection.items()},
     ),
     "slip_by_torque": lambda fit, data, measured: curve_figure(fit, measured),
     "current_by_traction": lambda fit, data, measured: current_figure(measured),
@@ -176,6 +181,6 @@ def validate_plots(fit: Fit, data: Runs, found: Validation, out: Path) -> list[P
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {
         "validation_errors": found.plot(),
-        "validation_paths": path_figure(fit.contact, data, order, PATHS + found.which),
+        "validation_paths": path_figure(fit.robot, fit.tracks, data, order, PATHS + found.which),
     }
     return save_all(figures, out)

@@ -1,6 +1,7 @@
 """Figures of motion: slip and drift over heading, and predicted and measured paths."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -9,12 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
+from slipid.data.windows import Windows
 from slipid.model.robot import Robot
 from slipid.plots import drawing
 from slipid.plots.measured_windows import MeasuredWindows, by_heading
 from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import Encoder
-from slipid.predict.predictive import ForceBalance
 from slipid.predict.slip_models import FloorModels
 
 ROWS = (
@@ -111,29 +112,37 @@ def runs_by_setup(data: Runs) -> dict[tuple[str, str], list[int]]:
 
 
 def path_figure(
-    model: ForceBalance, data: Runs, order: Sequence[tuple[str, str]], title: str
+    robot: Robot,
+    predict: Callable[[Windows], replay.Tracks],
+    data: Runs,
+    order: Sequence[tuple[str, str]],
+    title: str,
+    errors: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
     """Draw measured and predicted paths of some runs, one panel per floor and load set-up.
 
     All paths start at the origin with the robot facing right.
 
     Args:
-        model: force balance that predicts the paths, including shared effects of fitted runs.
+        robot: fitted robot.
+        predict: function that predicts the paths of windows.
         data: the runs.
         order: (floor, load set-up) of the panels in order.
         title: title of the figure, which names the set of runs.
+        errors: text about prediction errors under a panel's name, keyed by floor; by default the
+            mean end-point errors of the drawn floor's runs.
     """
     groups = runs_by_setup(data)
     names = [name for name in order if name in groups]
-    paths = _paths(model, data)
+    paths = _paths(robot, predict, data)
     made, axes = drawing.panels(len(names), 3.7, 4.3, title)
     for ax, (surface, load) in zip(axes, names, strict=True):
         runs = groups[surface, load]
         shown = [paths[k] for k in _spread(data, runs)]
         for run in shown:
             _ray(ax, run)
-        errors = _errors([paths[k] for k in runs])
-        ax.set_title(f"{named(surface, load, names)}\n{errors}", fontsize=10)
+        text = errors.get(surface) or _errors([paths[k] for k in runs])
+        ax.set_title(f"{named(surface, load, names)}\n{text}", fontsize=10)
         reach = 1.08 * max(float(np.abs(p).max()) for run in shown for p in run)
         ax.set_aspect("equal")
         ax.set(xlim=(-reach, reach), xlabel="ahead of the start [m]")
@@ -173,12 +182,13 @@ class _Paths(NamedTuple):
     encoder: np.ndarray
 
 
-def _paths(model: ForceBalance, data: Runs) -> dict[int, _Paths]:
+def _paths(
+    robot: Robot, predict: Callable[[Windows], replay.Tracks], data: Runs
+) -> dict[int, _Paths]:
     """Return the paths of every run, keyed by the run's index."""
     out: dict[int, _Paths] = {}
-    robot = model.robot
     for w in replay.replay_windows(data, robot):
-        tracks = model.tracks(w)
+        tracks = predict(w)
         encoder = replay.tracks_from_increments(
             robot, w, FloorModels(Encoder()).increments(w, robot)
         )
@@ -193,13 +203,13 @@ def _paths(model: ForceBalance, data: Runs) -> dict[int, _Paths]:
 
 
 def _errors(paths: Sequence[_Paths]) -> str:
-    """Return a text with mean end-point errors relative to displacement, of model and encoders."""
+    """Return a text with mean end-point errors over the path length, of model and encoders."""
     ends = np.array([[p[-1] for p in run] for run in paths])
-    chord = np.maximum(np.linalg.norm(ends[:, 0], axis=1), 1e-9)
-    error = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / chord[:, None]
+    path = [np.linalg.norm(np.diff(run.measured, axis=0), axis=1).sum() for run in paths]
+    error = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / np.maximum(path, 1e-9)[:, None]
     model, encoder = 100 * error.mean(axis=0)
     count = f"{len(paths)} runs" if len(paths) > 1 else "1 run"
-    return f"{count}: end-point error {model:.1f} % (encoders {encoder:.1f} %)"
+    return f"{count}: off by {model:.1f} % of the path (encoders {encoder:.1f} %)"
 
 
 def _ray(ax: Axes, paths: _Paths) -> None:

@@ -88,6 +88,15 @@ class FloorSelection:
         """Name of the model with the smallest error."""
         return min(self.errors, key=lambda name: self.errors[name])
 
+    @property
+    def sentence(self) -> str:
+        """The selected model and its error on held-out runs, beside that of the config."""
+        which = "held-out" if self.held_out else "fitted"
+        text = f"{self.model}: {100 * self.errors[self.model]:.2f} % of the path, {which} runs"
+        if self.model == "nominal" or "nominal" not in self.errors:
+            return text
+        return f"{text} (config's lengths {100 * self.errors['nominal']:.2f} %)"
+
     def to_json(self) -> Content:
         return asdict(self)
 

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Drives, Geometry, WheelFrame
+from slipid.model.kinematics import Steering
 from slipid.model.motor import Motor
 from slipid.model.robot import Standing
 from slipid.parameter import as_numbers
@@ -77,6 +78,8 @@ class RobotArrays(Drives):
             balance is used [m/rad, m/rad, 1].
         unseen: for each floor, True if no run drove on it.
         calibrated: for each floor, True if `kinematics` is used while all wheels are on it.
+        steering: steering on each floor of a robot that steers, which has no force balance; None
+            for others.
     """
 
     frame: WheelFrame
@@ -100,6 +103,7 @@ class RobotArrays(Drives):
     around: tuple[int, ...] = eqx.field(static=True)
     unseen: tuple[bool, ...] = eqx.field(static=True)
     calibrated: tuple[bool, ...] = eqx.field(static=True)
+    steering: Steering | None = eqx.field(default=None, kw_only=True)
 
     @property
     def arrays(self) -> "RobotArrays":
@@ -220,6 +224,8 @@ class DeployedRobot(RobotArrays):
         the currents best, with a large uncertainty of the motion. Without additional floors it
         would select an identified floor.
         """
+        if self.steering is not None:
+            raise ValueError("no hypothetical floors for a robot that steers: they need forces")
         return DeployedRobot.of(with_unseen(self.record), self.load_setup)
 
 
@@ -283,7 +289,7 @@ def _arrays(
             **{name: as_numbers(np.stack([row[name] for row in rows])) for name in rows[0]},
             labels=record.labels,
         ),
-        rest=as_numbers(values[f"robot.load_share@{chosen.name}"]),
+        rest=as_numbers(np.atleast_1d(values[f"robot.load_share@{chosen.name}"])),
         mass=as_numbers(values["robot.mass"]),
         process=as_numbers([floor.process for floor in floors]),
         effect=as_numbers(whole if spread else effect),
@@ -300,9 +306,20 @@ def _arrays(
         around=geometry.around,
         unseen=tuple(floor.unseen for floor in floors),
         calibrated=tuple(floor.kinematics is not None for floor in floors),
+        steering=_steering(record),
         record=record,
         load_setup=chosen.name,
     )
+
+
+def _steering(record: RobotRecord) -> Steering | None:
+    """Return the steering on every floor, or None if no wheel is steered."""
+    s = record.steering
+    if s is None:
+        return None
+    front = float(record.wheels.driven == "front")
+    rows = [(f.wheelbase, s.zero, s.gain, s.understeer, front) for f in record.floors]
+    return Steering(*(as_numbers(column) for column in zip(*rows, strict=True)))
 
 
 def _effect_table(load: LoadRecord, whole: Float[np.ndarray, "floor 3"]) -> EffectLookup:

@@ -15,6 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from slipid.model.kinematics import MOST
 from slipid.model.se2 import advance, compose
 from slipid.parameter import as_numbers
 from slipid.robot.deployed import RobotArrays
@@ -46,6 +47,7 @@ class EstimatorState(eqx.Module):
         floors: belief about the floors under the wheels.
         place: pose with its covariance.
         stuck: time since the body stopped moving while its wheels turn [s].
+        steering: last steering angle of a robot that steers [rad]; None for others.
     """
 
     wheels: WheelState
@@ -53,6 +55,7 @@ class EstimatorState(eqx.Module):
     floors: FloorState
     place: PoseState
     stuck: Float[Array, ""]
+    steering: Float[Array, ""] | None = None
 
 
 class Estimator(AbstractEstimator[EstimatorState]):
@@ -92,6 +95,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
             floors=FloorFilter(f, s).init(),
             place=PoseFilter(f, s).init(pose, std),
             stuck=jnp.zeros(()),
+            steering=None if f.steering is None else f.steering.zero[0],
         )
 
     def advance(
@@ -110,7 +114,11 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
         gyro = jnp.where(jnp.isfinite(z.gyro) & (jnp.abs(z.gyro) < 50.0), z.gyro, jnp.nan)
         turn = gyro - old.place.nuisance[-1]
-        by_floor, by_pose, before = FloorFilter(f, s), PoseFilter(f, s), old.place
+        steering = old.steering
+        if z.steering_angle is not None and steering is not None:
+            read = jnp.isfinite(z.steering_angle) & (jnp.abs(z.steering_angle) < MOST)
+            steering = jnp.where(read, z.steering_angle, steering)
+        by_floor, by_pose, before = FloorFilter(f, s, steering), PoseFilter(f, s), old.place
         if self.floor is None:
             floors, motion = by_floor.step(old.floors, w, currents, turn, tick)
         else:
@@ -124,7 +132,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         place, twist, left = by_pose.step(before, motion, gyro, z, tick)
         floors = replace(floors, apart=floors.apart @ left.T)
         stuck = self._stuck(old.stuck, w, twist, tick)
-        new = EstimatorState(wheels, currents.filtered, floors, place, stuck)
+        new = EstimatorState(wheels, currents.filtered, floors, place, stuck, steering)
         unknown = floors.belief[-1]
         none = jnp.full((f.wheels, 1), unknown)
         return new, StateEstimate(

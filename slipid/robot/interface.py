@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Generic, TypeVar
 
@@ -92,6 +93,7 @@ class Settings(eqx.Module):
 class Readings(eqx.Module):
     """A measurement with NaN for all absent readings; attributes as in `Measurement`.
 
+    `steering_angle` is None if there is no reading, so that only robots that steer have it.
     Readings have the same structure for all robots with the same number of drives, whatever sensors
     a robot has, so that compiled code is shared.
     """
@@ -104,6 +106,7 @@ class Readings(eqx.Module):
     fix: Float[Array, "*batch 3"]
     fix_std: Float[Array, "*batch 2"]
     fix_age: Float[Array, "*batch"]
+    steering_angle: Float[Array, "*batch"] | None = None
 
     @classmethod
     @eqx.filter_jit
@@ -133,6 +136,8 @@ class Measurement(eqx.Module):
         fix_std: std of the fix's position [m] and heading [rad]; a fix without it is ignored.
         fix_age: age of the fix [s]; an unknown age counts as 0. A fix older than the estimator's
             history of poses, which goes back 47 steps, is ignored.
+        steering_angle: steering angle of a robot that steers, as logged, positive to the left
+            [rad]; without a reading the last one counts.
     """
 
     wheel_angle: Given = None
@@ -143,6 +148,7 @@ class Measurement(eqx.Module):
     fix: Given = None
     fix_std: Given = None
     fix_age: Given = None
+    steering_angle: Given = None
 
     def filled(self, drives: int) -> Readings:
         """Return the same measurement with NaN for all absent readings.
@@ -153,7 +159,8 @@ class Measurement(eqx.Module):
         given = vars(Readings.nothing(drives))
         for name, value in vars(self).items():
             if value is not None:
-                array, shape = jnp.asarray(value, dtype=float), given[name].shape
+                array = jnp.asarray(value, dtype=float)
+                shape = () if name == "steering_angle" else given[name].shape
                 if array.shape != shape:
                     of = f"a robot with {drives} encoders"
                     raise ValueError(f"{name} of shape {array.shape}; expected {shape} for {of}")
@@ -232,6 +239,11 @@ class AbstractEstimator(eqx.Module, Generic[State]):
         as 0.
         """
         z, dt = measurement.filled(self.robot.drives), jnp.asarray(dt, dtype=float)
+        angle = z.steering_angle
+        if self.robot.steering is None:
+            z = replace(z, steering_angle=None)
+        elif angle is None:
+            z = replace(z, steering_angle=jnp.asarray(jnp.nan))
         given = jax.tree.leaves((self, state, z, dt))
         if any(isinstance(x, jax.core.Tracer) for x in given):
             return self.advance(state, z, dt)

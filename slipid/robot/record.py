@@ -31,6 +31,7 @@ UNITS = {
     "floors.process": "m/sqrt(m), m/sqrt(m), rad/sqrt(m)",
     "floors.effect": "m/m, m/m, rad/m",
     "floors.kinematics": "m/rad, m/rad, rad/rad",
+    "floors.wheelbase": "m",
     "floors.current_std": "A",
     "floors.seen.wheel_speed": "rad/s",
     "floors.seen.torque_nm": "N*m",
@@ -48,6 +49,9 @@ UNITS = {
     "loads.wheel_curve": "1, 1/A",
     "current_trend": "A, A*s/m",
     "highest_speed": "rad/s",
+    "steering.zero": "rad",
+    "steering.gain": "1",
+    "steering.understeer": "s^2/m",
     "gains.loss": "mm",
 }
 """Units of the fields of robot.json, keyed by the field's path without indices."""
@@ -100,6 +104,16 @@ class Wheels:
     grips: tuple[bool, ...]
     drive_of: tuple[int, ...]
     gear_ratio: float
+    driven: str | None = None
+
+
+@dataclass(frozen=True)
+class SteeringRecord:
+    """Steering of a robot that steers, see `slipid.model.kinematics.Steering`."""
+
+    zero: float
+    gain: float
+    understeer: float
 
 
 @dataclass(frozen=True)
@@ -117,6 +131,7 @@ class FloorRecord:
         kinematics: rows of the matrix from the drives' wheel speeds to the body twist, where
             calibrated kinematics were selected for all wheels on this floor; None where the force
             balance is used.
+        wheelbase: effective wheelbase of a robot that steers; None for others.
     """
 
     name: str
@@ -126,6 +141,7 @@ class FloorRecord:
     seen: Validity | None
     unseen: bool = False
     kinematics: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] | None = None
+    wheelbase: float | None = None
 
 
 @dataclass(frozen=True)
@@ -277,6 +293,7 @@ class RobotRecord:
         versions: versions of the software that computed the parameters.
         draws: posterior draws of the fitted parameters, keyed by path.
         gains: tuned gains; None if there are none.
+        steering: steering of a robot that steers; None for others.
     """
 
     source: Source = "given"
@@ -293,6 +310,7 @@ class RobotRecord:
     versions: Mapping[str, str] = field(default_factory=dict)
     draws: Mapping[str, tuple[Numbers, ...]]
     gains: GainsRecord | None = None
+    steering: SteeringRecord | None = None
 
     @cached_property
     def numbers(self) -> str:

@@ -220,12 +220,26 @@ def check_record(record: RobotRecord) -> None:
     for floor in record.floors:
         for row in floor.kinematics or ():
             _counted(f"floors, {floor.name}: kinematics", row, drives)
+    _steered(record)
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
         _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, drives)
         if load.told is not None:
             _check_effects(f"loads, {load.name}: told", load.told, len(record.floors))
     _numbers(record)
+
+
+def _steered(record: RobotRecord) -> None:
+    """Raise `ValueError` if a record has only some of the numbers of a robot that steers."""
+    driven = record.wheels.driven
+    if driven not in (None, "rear", "front"):
+        raise ValueError(f"wheels.driven: '{driven}'; expected rear, front or null")
+    parts = [record.steering, *(of for f in record.floors for of in (f.kinematics, f.wheelbase))]
+    if driven is not None and None in parts:
+        raise ValueError(
+            "wheels.driven is given, but not steering, or not kinematics and wheelbase of every "
+            "floor; expected all of them, since a robot that steers has no force balance"
+        )
 
 
 def geometry_of(record: RobotRecord) -> Geometry:

@@ -14,8 +14,12 @@ from slipid.parameter import as_numbers
 from slipid.predict.kinematics import Calibrated, nominal
 from slipid.predict.open_loop import replay_windows, tracks_from_increments
 from slipid.predict.slip_models import FloorModels
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.estimator import Estimator
+from slipid.robot.interface import Measurement
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
+from tests.benchmarks.every_robot import rivals
 from tests.benchmarks.every_robot.drive import write
 from tests.benchmarks.every_robot.fits import covered
 from tests.benchmarks.every_robot.robots import ROBOTS
@@ -168,6 +172,34 @@ def test_identify_calibrates_alone_and_says_so(car, tmp_path):
     found = Calibration.of_json(content["calibration"])
     assert json.loads(json.dumps(found.to_json())) == content["calibration"]
     assert "straight ahead at 0.8" in str(found)
+
+
+def test_its_estimator_steers(car, tmp_path):
+    """Open loop from the first pose, with a steering angle in every third step."""
+    out = tmp_path / "out"
+    invoke("identify", car / "robot.toml", "--data", car / "logs", "--out", out, "--quiet")
+    robot = DeployedRobot.load(out / "robot.json")
+    estimator, track = Estimator(robot), rivals.read(CAR, car / "fresh")[0]
+    assert float(robot.steering.wheelbase[0]) == pytest.approx(CAR.floors[0].base, rel=0.03)
+    state = estimator.init()
+    for k, dt in enumerate(np.diff(track.t, prepend=track.t[0])):
+        angle = track.steering[k] if k % 3 == 0 else None  # the last reading counts
+        measured = Measurement(wheel_angle=track.angle[k], steering_angle=angle)
+        state, estimate = estimator.step(state, measured, dt)
+        assert bool(estimate.finite)
+    k = rivals.true(CAR)
+    true_path = rivals.sensor_path(rivals.kinematic(CAR, k), replace(k, place=(0.0, 0.0)), track)
+    path = np.hypot(*np.diff(true_path[:, :2], axis=0).T).sum()
+    gap = np.asarray(estimate.pose)[:2] - true_path[-1, :2]
+    assert np.hypot(*gap) < 0.01 * path
+    assert float(estimate.pose[2]) == pytest.approx(true_path[-1, 2], abs=0.05)
+    assert abs(true_path[-1, 2]) > 1
+    done = invoke("export", out / "robot.json", "--out", tmp_path / "exported")
+    assert done.exit_code == 2
+    assert "`slipid export` are not available" in done.stderr
+    assert "(of a robot with steered wheels, identify alone)" in done.stderr
+    with pytest.raises(ValueError, match="no hypothetical floors for a robot that steers"):
+        robot.with_unseen()
 
 
 def test_what_needs_a_force_balance_says_that_there_is_none(car, tmp_path):

@@ -146,8 +146,8 @@ def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_pa
         config, tmp_path / "recorded" / "unseen" / "logs", Reporter(quiet=True)
     ).dataset
     order = [("firm", "as_built"), ("soft", "as_built"), ("soft", "moved")]
-    drawn = path_figure(done.fit.contact, data, order, "unseen runs").axes
+    drawn = path_figure(done.fit.robot, done.fit.tracks, data, order, "unseen runs").axes
     for ax, floor in zip(drawn, ("firm", "soft", "soft@moved"), strict=False):
         by = found["summary"][floor]
-        mine, encoder = (100 * by[m]["endpoint_error_mean"] for m in ("identified", "encoder"))
-        assert f"end-point error {mine:.1f} % (encoders {encoder:.1f} %)" in ax.get_title()
+        mine = 100 * by["selected"]["endpoint_error_over_path_mean"]
+        assert f"off by {mine:.1f} % of the path" in ax.get_title()

@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.model.contact import settle
 from slipid.model.contact_balance import Balance, stand
+from slipid.model.kinematics import rolled as rolled_motion
 from slipid.model.motor import sign_of_motion
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import Planar, advance, compose, solve3
@@ -108,10 +109,17 @@ class BodyMotion(eqx.Module):
 
 
 class FloorFilter(eqx.Module):
-    """Filter over the floors under the wheels."""
+    """Filter over the floors under the wheels.
+
+    Attributes:
+        robot: identified robot.
+        settings: settings of the estimator.
+        angle: steering angle of a robot that steers [rad]; None for others.
+    """
 
     robot: RobotArrays
     settings: Settings
+    angle: Float[Array, ""] | None = None
 
     def init(self) -> FloorState:
         """Return the state before any measurement."""
@@ -161,12 +169,16 @@ class FloorFilter(eqx.Module):
         settled, predicted = self.solve(old.twist, w)
         f, hypotheses = self.robot, hypotheses_of(self.robot)
         rolling = f.inverse @ (f.frame.radius * w)
+        if f.steering is not None:
+            # no motor is modelled, so that currents tell nothing of the floor
+            rolling = settled[hypotheses.uniform[0]]
+            currents = replace(currents, measured=jnp.zeros_like(currents.measured))
         rolled = RolledMotion.of(rolling, f.frame.base)
         mean, part = f.effect_table.at(rolled)
         # add mean effects only to hypotheses with all wheels on one floor: only these were fitted
         effect = rolled.speed * mean @ rolled.axes.T
         xi = settled + jnp.zeros((len(hypotheses), 3)).at[hypotheses.uniform].set(effect)
-        if any(f.calibrated):
+        if f.steering is None and any(f.calibrated):
             floors = np.flatnonzero(f.calibrated)
             xi = xi.at[hypotheses.uniform[floors]].set(f.kinematics[floors] @ w)
         known_log, unknown_log = self._evidence(xi, predicted, currents, w, turn)
@@ -216,6 +228,9 @@ class FloorFilter(eqx.Module):
         `w` are the wheel speeds [rad/s]; the iteration starts from `near`, the last step's twists.
         """
         f = self.robot
+        if f.steering is not None:
+            twists = self._steered(w)
+            return twists, jnp.zeros((len(twists), f.drives))
         on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
         rim = f.frame.radius * f.at_wheels(w)
         twist, pull = settle(near.T, rim, on, f.by_wheels)
@@ -227,6 +242,14 @@ class FloorFilter(eqx.Module):
         more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ (f.frame.radius * w))[:2])])
         return twist.T, amps + jnp.sign(amps) * more
 
+    def _steered(self, w: Float[Array, " drive"]) -> Float[Array, "hypothesis 3"]:
+        """Return the twist of every hypothesis of a robot that steers, the mean over its wheels."""
+        f, angle = self.robot, self.angle if self.angle is not None else jnp.zeros(())
+        # a step of a second turns the wheels by their speeds
+        columns = jnp.concatenate([w, jnp.stack([angle * jnp.mean(w), jnp.ones(())])])
+        on_floor = jax.vmap(rolled_motion, (0, None, 0))(f.kinematics, columns, f.steering)
+        return hypotheses_of(f).on.mean(axis=1) @ on_floor
+
     def _by_friction(self, twist: Array, w: Array, under: Array) -> Float[Array, "3 floor"]:
         """Return the derivative of a twist with respect to each floor's log friction.
 
@@ -234,6 +257,8 @@ class FloorFilter(eqx.Module):
         speed, since linearization fails if all wheels slide.
         """
         f = self.robot
+        if f.steering is not None:
+            return jnp.zeros((3, len(f.labels)))
         rim = f.frame.radius * f.at_wheels(w)
         shared = f.floors.mixed(under)
         on, xi = stand(f.frame, shared, f.rest), Planar(*twist)

@@ -7,6 +7,8 @@ from math import tau
 import numpy as np
 import pytest
 
+from slipid.data.reading.bag.layout import declared_bag_layout
+from slipid.data.reading.reader import read_logs
 from tests.helpers.made_bags import (
     ROBOTINO,
     STORAGES,
@@ -115,6 +117,23 @@ def test_other_sensors_come_back_at_their_own_times(tmp_path, storage):
     np.testing.assert_allclose(have["motor_speed"][1][0], np.array([60, 30, -60]) * tau / 60)
     np.testing.assert_array_equal(have["wheel_ticks"][1][-1], np.array([1, 2, 3]) * (len(slow) - 1))
     np.testing.assert_array_equal(have["current"][1][5], [0.5, 1.5, 2.5])
+
+
+def test_the_twist_of_odometry_is_a_motion_of_its_own(tmp_path):
+    """It needs no field and no unit, and stands for the travel of a robot without wheels."""
+    twist = {"linear": vector(0.4), "angular": vector(z=-0.2)}
+    messages = [
+        Message(
+            "/odom", "nav_msgs/msg/Odometry", {"header": header(t), "twist": {"twist": twist}}, t
+        )
+        for t in TIME.tolist()
+    ]
+    layout = declared_bag_layout({"topics": {"twist": {"topic": "/odom"}}}, "layout")
+    path = bag(tmp_path, "mcap", messages)
+    (log,) = read_logs(path, layout, path.parent, None, "as_built").logs
+    assert log.wheels == 0
+    seconds = TIME[-1] - TIME[0]
+    np.testing.assert_allclose(log.travel[-1], [0.4 * seconds, 0.0, -0.2 * seconds], atol=1e-5)
 
 
 def imu_fields(t, k):
