@@ -53,13 +53,13 @@ SLIP_SEEN = 0.01
 """Relative difference of rolling radii between floors, and std of the runs' effects per distance,
 above which slip is seen [1]."""
 DRIVING, LEAST_M_S = 0.3, 0.01
-"""A robot drives in the steps in which its speed exceeds this share of the largest [1]; a robot that
-is slower than the second number [m/s] turns on the spot."""
+"""A robot drives in the steps in which its speed exceeds this share of the largest [1]; a robot
+that is slower than the second number [m/s] turns on the spot."""
 SPEED_STEP_S = 0.4
 """Duration of the steps over which the speed of the wheels is averaged [s]."""
 ONE_SPEED = 1.3
-"""Ratio of the speeds exceeded in 10 % and in 90 % of the steps in which a robot drives, below which
-it is driven at one speed [1]."""
+"""Ratio of the speeds exceeded in 10 % and in 90 % of the steps in which a robot drives, below
+which it is driven at one speed [1]."""
 FAR_FROM_CONFIG = 0.02
 """Relative difference of a calibrated length from the config's that is reported [1]."""
 
@@ -159,8 +159,12 @@ def _one_speed(task: FitTask) -> Iterator[str]:
     yield (
         f"one speed alone on {places}: whether slip grows with speed (its viscous terms) cannot be "
         "told, so other speeds are extrapolated"
-        + ("" if headings else "; without headings, the lag of the poses and the place of their "
-        "sensor ahead are nearly one number")
+        + (
+            ""
+            if headings
+            else "; without headings, the lag of the poses and the place of their "
+            "sensor ahead are nearly one number"
+        )
         + "; drive also at half or twice this speed"
     )
 

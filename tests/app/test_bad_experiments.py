@@ -93,7 +93,9 @@ def one_heading_first(columns: Columns, run: int) -> Columns:
 def test_wheels_that_never_turn_are_named_with_their_channel():
     (found,) = alarms(task_of(SQUARES, still))
     assert found.kind == "no_motion"
-    assert re.search(r"no wheel turns in these runs, although the poses move by up to \d", str(found))
+    assert re.search(
+        r"no wheel turns in these runs, although the poses move by up to \d", str(found)
+    )
     assert "the channel wheel_ticks names the columns" in str(found)
 
 
@@ -123,7 +125,6 @@ def test_a_heading_that_never_changes_is_named_where_wheels_turn_the_robot(robot
 
 def test_one_run_with_a_constant_heading_is_named():
     found = alarms(task_of(SQUARES, one_heading_first))
-    print(found)
     assert [f.kind for f in found] == ["heading_constant"]
 
 

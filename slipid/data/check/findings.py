@@ -84,8 +84,8 @@ NOT_CALIBRATED = frozenset(
         *("pose_of_another_run", "pose_unexplained", "steering_sign"),
     )
 )
-"""Kinds of findings about order, signs, axes and missing motion, with which calibrated lengths would
-be meaningless."""
+"""Kinds of findings about order, signs, axes and missing motion, with which calibrated lengths
+would be meaningless."""
 
 
 def heading_constant(turned: float, runs: Sequence[str], count: int) -> Finding:
