@@ -6,10 +6,11 @@ config. Single runs are searched for constant poses and for poses of another run
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_ticks`,
 `wheel_speed_unit`, `no_motion`, `heading_constant`, `heading_sign`, `heading_unit`,
 `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`, `pose_mirrored`, `pose_length`,
-`pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`, `base_radius`, `time_unit`, `current_sign`, `current_order`,
-`current_unit`, `current_of_supply`, `voltage_sign`, `voltage_order`, `voltage_unit`, `gyro_sign`,
-`gyro_unit`, `command_sign`, `command_order`, `command_unit`, `command_exchanged`, `wheel_columns`,
-`scales`, `travel`, `steering_sign`, `steering_scale`, `not_checked`.
+`pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`, `base_radius`, `time_unit`,
+`current_sign`, `current_order`, `current_unit`, `current_of_supply`, `voltage_sign`,
+`voltage_order`, `voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`, `command_order`,
+`command_unit`, `command_exchanged`, `wheel_columns`, `scales`, `travel`, `steering_sign`,
+`steering_scale`, `not_checked`.
 """
 
 from collections.abc import Iterator, Mapping
