@@ -27,8 +27,8 @@ def steered_findings(data: Runs, shape: Geometry) -> Iterator[Finding]:
     lag = pose_lag(data)
     late = lag.seconds if lag is not None and lag.decisive else 0.0
     parts = [_motions(data, run, shape, late) for run in range(len(data))]
-    turning = [np.ptp(np.cumsum(part[:, 1::2], axis=0), axis=0) for part in parts if len(part)]
-    logged, expected = np.max(turning, axis=0, initial=0.0)
+    spans = [np.ptp(np.cumsum(part[:, 1::2], axis=0), axis=0) for part in parts if len(part)]
+    logged, expected = np.max(np.reshape(spans, (-1, 2)), axis=0, initial=0.0)
     if logged < ROUNDING_RAD and expected > LEAST_TURN_RAD:
         yield heading_constant(float(expected), [log.name for log in data.logs], len(data))
         return
