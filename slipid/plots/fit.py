@@ -136,6 +136,7 @@ FIGURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
         data,
         measured.groups,
         PATHS + "runs of the fit, predicted by the model selected on each floor",
+        fit.config_shape,
         {floor: one.sentence for floor, one in fit.selection.items()},
     ),
     "slip_by_torque": lambda fit, data, measured: curve_figure(fit, measured),
