@@ -110,6 +110,9 @@ def test_headings_alone_show_ratios_of_lengths(task_of):
     assert np.ptp(left.interval90) > 0.5 * left.value
     assert left.value / right.value == pytest.approx(0.0505 / 0.0495, rel=2e-3)
     assert near(found.base["floor"], 0.315, 2e-3)
+    low, high = found.base["floor"].interval90
+    assert low < 0.315 < high
+    assert high - low < 0.01
     assert [place.verdict for place in found.offset] == ["not_identified"] * 2
     assert found.lag.verdict == "identified"
     for name, true in (("gyro_scale", 1.0), ("gyro_bias_rad_s", 0.003)):
