@@ -147,8 +147,10 @@ def test_exchanged_wheels_are_named_whatever_the_radius(robot, radius):
     [("omni3_right", (1, 2, 0), "3, 1, 2"), ("mecanum_wrong_base", (0, 1, 3, 2), "1, 2, 4, 3")],
 )
 def test_permuted_wheels_are_named_whatever_the_radius(name, order, says, radius):
-    first, *_ = alarms(task_of(replace(NAMED[name], runs=2), radius=radius, order=order))
+    first, *rest = alarms(task_of(replace(NAMED[name], runs=2), radius=radius, order=order))
     assert first.kind == "wheel_order"
+    assert [f.kind for f in rest] == ([] if radius > 1 else ["wheel_scale"])
+    assert all("correct wheel_radius_m in [robot]" in (f.remedy or "") for f in rest)
     assert f"list the columns in the order {says} " in (first.remedy or "")
 
 

@@ -322,7 +322,7 @@ def _factor_finding(cause: ScaleCause, gear_ratio: float, reading: WheelReading)
         turns = _turns(factor, gear_ratio, reading)
         remedy = f"divide wheel_radius_m in [robot] by {factor:.3g}, or {turns}"
     elif kind == "wheel_scale":
-        remedy = _turns(factor, gear_ratio, reading)
+        remedy = f"{_turns(factor, gear_ratio, reading)}, or correct wheel_radius_m in [robot]"
     elif cause.name == "base":
         found = (
             f"{channel} is {'more' if factor > 1 else 'less'} than declared, by a factor of {ratio}"
