@@ -58,8 +58,8 @@ that is slower than the second number [m/s] turns on the spot."""
 SPEED_STEP_S = 0.4
 """Duration of the steps over which the speed of the wheels is averaged [s]."""
 ONE_SPEED = 1.3
-"""Ratio of the speeds exceeded in 10 % and in 90 % of the steps in which a robot drives, below
-which it is driven at one speed [1]."""
+"""Ratio of the speeds exceeded in 10 % and in 85 % of the steps in which a robot drives, below
+which it is driven at one speed [1]; the other steps may be starts and stops."""
 FAR_FROM_CONFIG = 0.02
 """Relative difference of a calibrated length from the config's that is reported [1]."""
 
@@ -149,7 +149,7 @@ def _one_speed(task: FitTask) -> Iterator[str]:
     for floor, parts in speeds.items():
         each = np.concatenate(parts)
         driven = each[each > DRIVING * each.max()]
-        low, high = np.quantile(driven, [0.1, 0.9]) if len(driven) else (0.0, 0.0)
+        low, high = np.quantile(driven, [0.15, 0.9]) if len(driven) else (0.0, 0.0)
         if LEAST_M_S < high < ONE_SPEED * low:
             usual[floor] = float(np.median(driven))
     if not usual:
