@@ -37,9 +37,6 @@ from slipid.fitting.variances import (
     scoring_step,
 )
 
-LENGTHS, SAME_LENGTH = ("robot.wheel_radius", "robot.base_radius"), 0.02
-"""Lengths whose prior means are tried as start values, too, and the largest difference of their
-logarithms from the start values that needs no second try [1]."""
 _MOST_REFUSED = 12
 """Largest number of steps that the solver may refuse in a round."""
 
@@ -190,8 +187,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
 
     While all other parameters are fixed, floors have no parameter in common, so that one fit in
     which only the floors' parameters may move fits each floor independently. The start with the
-    least loss is chosen floor by floor. Smaller wheels and slip look alike; so where the start's
-    lengths are not the prior means, both are tried, and those with the least loss are chosen.
+    least loss is chosen floor by floor.
     """
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)
@@ -201,34 +197,27 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
     wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
     first = _motor_start(problem, keep)
-    length = space.where(lambda e: e.path in LENGTHS)
-    others = np.where(length, space.prior_mean, first)
-    several = np.abs(others - first).max(initial=0.0) > SAME_LENGTH
     independent = problem.without_shared_effects()
+    best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
     of_floor = np.repeat([e.surface or "" for e in space.free], [e.coordinates for e in space.free])
-    found: list[tuple[float, np.ndarray]] = []
-    for at in (first, others) if several else (first,):
-        best, z = np.full(len(labels), np.inf), at.copy()
-        for attempt, value in enumerate(CREEPS):
-            stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
-            start = np.where(creep, np.log(value), at)
-            state = FitState(start, log_v, 0, np.inf, np.inf, stage)
-            # Many steps at first, since the damping starts at 1, far below the problem's scale.
-            for steps in (15, 6, 6):
-                state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
-                tell(state)
-            residual, _ = independent.linear(state.z, problem.electric(state.z, log_v))
-            weights = problem.whitening(residual, log_v, problem.full_weight).weight["motion"]
-            # the loss of each segment, up to a factor and an offset
-            cost = -np.log(np.asarray(weights))
-            for number, label in enumerate(labels):
-                mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
-                if mine < best[number]:
-                    best[number] = mine
-                    z = np.where(of_floor == label, state.z, z)
-        found.append((float(best.sum()), z))
-    z = min(found, key=lambda one: one[0])[1]
+    for attempt, value in enumerate(CREEPS):
+        stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
+        start = np.where(creep, np.log(value), first)
+        state = FitState(start, log_v, 0, np.inf, np.inf, stage)
+        # Many steps at first, since the damping starts at 1, far below the scale of the problem.
+        for steps in (15, 6, 6):
+            state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
+            tell(state)
+        residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
+        found = problem.whitening(residual, state.log_variance, problem.full_weight)
+        # the loss of each segment, up to a factor and an offset
+        cost = -np.log(np.asarray(found.weight["motion"]))
+        for number, label in enumerate(labels):
+            mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
+            if mine < best[number]:
+                best[number] = mine
+                z = np.where(of_floor == label, state.z, z)
     return FitState(z, log_v, 0, np.inf, np.inf, "joint")
 
 
