@@ -60,9 +60,10 @@ def check(
     Arguments and errors are those of `fit`.
     """
     task = fit_task_of(runs, robot, priors or {}, fixed or {}, {}, free)
+    content = overview(task)
     with Reporter(quiet=True) as report:
-        started, part = calibration_part(task, report)
-    return LogCheck(overview(task) | part, expected(started, started.problem()))
+        started, part = calibration_part(task, content["findings"], report)
+    return LogCheck(content | part, expected(started, started.problem()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,17 @@
 """Calibration of a robot's kinematics from the logs of a config, without a force balance."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from slipid.app.bench_priors import COPY_NAME
 from slipid.app.logs import write_run_file
 from slipid.app.problem import NO_BALANCE, ConfigFitTask, FitTask
-from slipid.fitting.calibration import Calibration
+from slipid.data.wheel_signals import interpolate
+from slipid.fitting.calibration import ABSURD, Calibration
 from slipid.infer.fit_file import IDENTIFIED, SCHEMA
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
 from slipid.predict.selection import FloorSelection, KinematicFit, kinematic_fit, selected
@@ -49,19 +52,38 @@ def calibrated(task: FitTask, report: Reporter) -> KinematicFit:
 SLIP_SEEN = 0.01
 """Relative difference of rolling radii between floors, and std of the runs' effects per distance,
 above which slip is seen [1]."""
+DRIVING, LEAST_M_S = 0.3, 0.01
+"""A robot drives in the steps in which its speed exceeds this share of the largest [1]; a robot
+that is slower than the second number [m/s] turns on the spot."""
+SPEED_STEP_S = 0.4
+"""Duration of the steps over which the speed of the wheels is averaged [s]."""
+ONE_SPEED = 1.3
+"""Ratio of the speeds exceeded in 10 % and in 85 % of the steps in which a robot drives, below
+which it is driven at one speed [1]; the other steps may be starts and stops."""
 FAR_FROM_CONFIG = 0.02
 """Relative difference of a calibrated length from the config's that is reported [1]."""
 
 
-def remarks(found: KinematicFit, selection: Mapping[str, FloorSelection]) -> tuple[str, ...]:
+def remarks(
+    found: KinematicFit, selection: Mapping[str, FloorSelection], task: FitTask
+) -> tuple[str, ...]:
     """Return sentences about what the runs do not tell, and about suspected errors in the config.
 
     They are suspects, not reasons against the result: the calibrated numbers are used.
+
+    Args:
+        found: calibrated kinematics of the task.
+        selection: selected model on each floor.
+        task: runs, robot and choices.
     """
     c = found.calibration
     out = list(found.suspects)
     what = "base" if c.sideways else "track"
-    straight = [f for f, v in c.base.items() if v.verdict == "not_identified"]
+    straight = [
+        f
+        for f, v in c.base.items()
+        if v.verdict == "not_identified" and not _is_absurd(v.value / c.nominal_base)
+    ]
     if len(straight) == len(c.base):
         out.append(
             f"no run turns: the effective {what} and the place of the pose sensor are not "
@@ -69,7 +91,8 @@ def remarks(found: KinematicFit, selection: Mapping[str, FloorSelection]) -> tup
         )
     elif straight:
         out.append(f"on {', '.join(straight)} no run turns: the effective {what} is not identified")
-    if any(v.verdict in ("weak", "not_identified") for v in c.radius[c.firmest]):
+    unseen = any(v.verdict in ("weak", "not_identified") for v in c.radius[c.firmest])
+    if unseen and not _is_absurd(_mean_radius(c) / c.nominal_radius):
         out.append(
             "the runs tell ratios of lengths, and little of the mean wheel radius: drive some "
             "metres straight ahead with known positions at both ends"
@@ -77,14 +100,22 @@ def remarks(found: KinematicFit, selection: Mapping[str, FloorSelection]) -> tup
     for floor, one in selection.items():
         if one.runs == 1:
             out.append(f"on {floor} one run alone: intervals come from its parts; drive several")
+    out += _one_speed(task)
     for name, value, nominal in (
         ("wheel radius", _mean_radius(c), c.nominal_radius),
         (what, c.base[c.firmest].value, c.nominal_base),
     ):
-        if abs(value / nominal - 1) > FAR_FROM_CONFIG and (name != what or not straight):
+        ratio = value / nominal
+        if _is_absurd(ratio):
+            out.append(
+                f"the {name} comes out {ratio:.3g} times as large as in the config, which is not "
+                "to be trusted: check the lengths of [robot], and the columns and units of wheels "
+                "and poses"
+            )
+        elif abs(ratio - 1) > FAR_FROM_CONFIG and (name != what or not straight):
             out.append(
                 f"the {name} in the config is {1e3 * nominal:.4g} mm; on {c.firmest} it is "
-                f"{1e3 * value:.4g} mm ({100 * (value / nominal - 1):+.1f} %)"
+                f"{1e3 * value:.4g} mm ({100 * (ratio - 1):+.1f} %)"
             )
     apart = [abs(v.value / _mean_radius(c) - 1) for row in c.radius.values() for v in row]
     effects = [max(x[:2]) for x in c.noise.effect.values()]
@@ -97,6 +128,45 @@ def remarks(found: KinematicFit, selection: Mapping[str, FloorSelection]) -> tup
             "tell them apart"
         )
     return tuple(out)
+
+
+def _is_absurd(ratio: float) -> bool:
+    """Return whether a calibrated length over the config's is far beyond what is plausible."""
+    return not 1 / ABSURD < ratio < ABSURD
+
+
+def _one_speed(task: FitTask) -> Iterator[str]:
+    """Yield a sentence about the floors on which all runs are driven at one speed, if any."""
+    runs, shape = task.dataset, task.robot.geometry
+    to_body = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
+    speeds: dict[str, list[np.ndarray]] = {}
+    for log in runs.logs:
+        edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / SPEED_STEP_S)))
+        turned = np.diff(interpolate(log.time, log.wheel_angle, edges), axis=0)
+        ahead = np.linalg.norm(turned @ to_body[:2].T, axis=1) / (edges[1] - edges[0])
+        speeds.setdefault(log.surface or "unknown", []).append(ahead)
+    usual = {}
+    for floor, parts in speeds.items():
+        each = np.concatenate(parts)
+        driven = each[each > DRIVING * each.max()]
+        low, high = np.quantile(driven, [0.15, 0.9]) if len(driven) else (0.0, 0.0)
+        if LEAST_M_S < high < ONE_SPEED * low:
+            usual[floor] = float(np.median(driven))
+    if not usual:
+        return
+    places = ", ".join(f"{floor} ({speed:.2g} m/s)" for floor, speed in usual.items())
+    headings = np.isfinite(runs.pose[:, 2]).any()
+    yield (
+        f"one speed alone on {places}: whether slip grows with speed (its viscous terms) cannot be "
+        "told, so other speeds are extrapolated"
+        + (
+            ""
+            if headings
+            else "; without headings, the lag of the poses and the place of their "
+            "sensor ahead are nearly one number"
+        )
+        + "; drive also at half or twice this speed"
+    )
 
 
 def _mean_radius(c: Calibration) -> float:
@@ -119,7 +189,7 @@ def calibrate_only(
     began = time.monotonic()
     found = calibrated(task, report)
     selection = selected(task.dataset, found.errors, found.contradicted)
-    trust = verdict_of_trust(selection, notes=remarks(found, selection))
+    trust = verdict_of_trust(selection, notes=remarks(found, selection, task))
     writable(out)
     runs = [log.name for log in task.logs]
     messages = [NO_BALANCE] if task.robot.geometry.driven is not None else []

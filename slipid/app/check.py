@@ -13,7 +13,7 @@ from slipid.app.config import read_config
 from slipid.app.logs import layout_of
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
-from slipid.data.check.findings import Finding, worst_first
+from slipid.data.check.findings import NOT_CALIBRATED, Finding, worst_first
 from slipid.data.check.sanity import findings
 from slipid.data.runs import Runs, channels
 from slipid.fitting.calibration import evenly
@@ -187,7 +187,7 @@ def check(
     task = read_fit_task(read_config(config_path), data, report)
     report.stage("comparing logs with config")
     content = overview(task, task.skipped)
-    task, part = calibration_part(task, report)
+    task, part = calibration_part(task, content["findings"], report)
     content |= part
     report.stage("expected information")
     try:
@@ -201,11 +201,18 @@ def check(
     return task.dataset, content
 
 
-def calibration_part(task: Task, report: Reporter) -> tuple[Task, Content]:
+def calibration_part(
+    task: Task, found_before: Sequence[Content], report: Reporter
+) -> tuple[Task, Content]:
     """Return the task started from its calibration, and the part of check.json about it.
 
-    Of many runs, `MOST_CALIBRATED` are calibrated; `slipid identify` calibrates all.
+    Of many runs, `MOST_CALIBRATED` are calibrated; `slipid identify` calibrates all. Runs that
+    contradict the config in order, axes or motion are not calibrated; `found_before` are the
+    findings about them, as in check.json.
     """
+    if any(f["severity"] == "wrong" and f["kind"] in NOT_CALIBRATED for f in found_before):
+        sentence = "no calibration before the findings marked wrong are corrected"
+        return task, {"suspects": [sentence]}
     data = task.dataset
     if len(data) > MOST_CALIBRATED:
         some = evenly([log.surface or "unknown" for log in data.logs], MOST_CALIBRATED)
@@ -215,7 +222,7 @@ def calibration_part(task: Task, report: Reporter) -> tuple[Task, Content]:
         found = calibrated(replace(task, dataset=data), report)
     except DataError as error:  # no run has poses while its wheels turn
         return task, {"suspects": [f"no calibration: {error}"]}
-    suspects = remarks(found, selected(data, found.errors, found.contradicted))
+    suspects = remarks(found, selected(data, found.errors, found.contradicted), task)
     content = {"calibration": found.calibration.to_json(), "suspects": list(suspects)}
     return task.started_from(found.calibration), content
 

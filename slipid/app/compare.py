@@ -11,23 +11,27 @@ from pathlib import Path
 import numpy as np
 
 from slipid.app.calibrate import calibrated
-from slipid.app.config import read_config, single_floor_sections
+from slipid.app.config import Config, read_config, single_floor_sections
 from slipid.app.logs import read_dataset
-from slipid.app.problem import ConfigFitTask, read_fit_task
+from slipid.app.problem import ConfigFitTask, read_fit_task, shape_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
+from slipid.fitting.calibration import Calibration
 from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import FitState, Problem
-from slipid.infer.fit_file import load
+from slipid.infer.fit_file import IDENTIFIED, load
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot
 from slipid.predict.folds import Fold, folds_of, judge
+from slipid.predict.kinematics import nominal
 from slipid.predict.ranking import ranking, transfer
-from slipid.predict.validation import ScoredRun, Validation
+from slipid.predict.selection import calibrated_model
+from slipid.predict.slip_models import FloorModels
+from slipid.predict.validation import ScoredRun, Validation, validation
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import writable, write_json
+from slipid.support.files import read_json, writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -192,14 +196,7 @@ def validate(
     """
     setup_jax(quiet=True)
     fit = load(out)
-    config = read_config(out / "config.toml")
-    logs, others = config.content.logs, config.content.validate_.logs
-    sections = single_floor_sections([*others, *logs] if glob is not None else others or logs)
-    report.stage("reading logs")
-    dataset, skipped = read_dataset(config, sections, data, report, glob)
-    refuse_misordered(dataset.logs)
-    for sentence in skipped:
-        report.line(sentence)
+    _, dataset = _judged(out, data, report, glob)
     if again := len(dataset) - fit.new_runs(dataset):
         report.line(
             f"{again} of {len(dataset)} runs were used in the fit: their errors say little about "
@@ -212,3 +209,42 @@ def validate(
         raise
     except ValueError as error:
         raise DataError(f"{out / 'fit.json'}: {error}") from error
+
+
+def validate_calibration(
+    out: Path, data: Path, report: Reporter, glob: str | None = None
+) -> Validation:
+    """Return the predictions of runs by the kinematics that `identify --only calibration` wrote.
+
+    Arguments and errors are those of `validate`.
+    """
+    setup_jax(quiet=True)
+    content = read_json(out / IDENTIFIED, "a result of `slipid identify`")
+    try:
+        found, chosen = Calibration.of_json(content["calibration"]), content["selected_model"]
+        fitted = set(content["data"]["runs"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{out / IDENTIFIED}: no calibration ({error}); run `slipid identify` again"
+        ) from error
+    config, dataset = _judged(out, data, report, glob)
+    shape = shape_of(config)
+    floors, loads = sorted(found.radius), sorted({log.load for log in dataset.logs})
+    robot = Robot.of(shape).on(floors, loads, sorted(set(dataset.session)))
+    new = sum(log.name not in fitted for log in dataset.logs)
+    report.stage("predicting")
+    models = [FloorModels(nominal(shape)), calibrated_model(found, shape)]
+    return validation(None, models, dataset, new, found.seen(robot), chosen)
+
+
+def _judged(out: Path, data: Path, report: Reporter, glob: str | None) -> tuple[Config, Runs]:
+    """Return the config in a result folder, and the runs that it or a pattern names."""
+    config = read_config(out / "config.toml")
+    logs, others = config.content.logs, config.content.validate_.logs
+    sections = single_floor_sections([*others, *logs] if glob is not None else others or logs)
+    report.stage("reading logs")
+    dataset, skipped = read_dataset(config, sections, data, report, glob)
+    refuse_misordered(dataset.logs)
+    for sentence in skipped:
+        report.line(sentence)
+    return config, dataset

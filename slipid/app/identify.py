@@ -278,7 +278,7 @@ def summarised(
         fit,
         calibration=kinematic.calibration,
         selection=selection,
-        suspects=remarks(kinematic, selection),
+        suspects=remarks(kinematic, selection, task),
     )
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)

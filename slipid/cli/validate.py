@@ -47,9 +47,12 @@ def run(out: Path, data: Path, report: Reporter, logs: str | None = None) -> Con
 
     Arguments are those of `slipid.app.compare.validate`.
     """
-    from slipid.app.compare import validate
+    from slipid.app.compare import validate, validate_calibration
+    from slipid.infer.fit_file import FIT, IDENTIFIED
     from slipid.plots.fit import validate_plots
 
+    if (out / IDENTIFIED).exists() and not (out / FIT).exists():
+        return validate_calibration(out, data, report, logs).to_json()
     fit, dataset, found = validate(out, data, report, logs)
     report.stage("drawing")
     drawn = validate_plots(fit, dataset, found, out)

@@ -61,6 +61,9 @@ from slipid.support.content import Content
 Verdict = Literal["identified", "weak", "not_identified", "fixed"]
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior) for the verdicts `identified` and `weak`."""
+ABSURD = 3.0
+"""Ratio of a calibrated length to the config's, or its inverse, from which on the length counts as
+not identified: the logs and the config must then contradict each other [1]."""
 RADIUS_STD, DRIVE_STD, FLOOR_STD, DRIVE_ON_FLOOR_STD, BASE_STD = 0.3, 0.05, 0.3, 0.03, 0.5
 """Prior stds of the logarithms of the radius, of the drives' deviations from it, of a floor's
 radius over that of the firmest floor, of the drives' further deviations on a floor, and of the
@@ -939,6 +942,8 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         ends = at - half, at + half
         if log_of is None:
             return Value(at, ends, std, verdict, unit)
+        if abs(at) > np.log(ABSURD):
+            verdict = "not_identified"
         best = log_of * float(np.exp(at))
         low, high = (log_of * float(np.exp(end)) for end in ends)
         return Value(best, (low, high), best * std, verdict, unit)

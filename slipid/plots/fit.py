@@ -136,6 +136,7 @@ FIGURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
         data,
         measured.groups,
         PATHS + "runs of the fit, predicted by the model selected on each floor",
+        fit.config_shape,
         {floor: one.sentence for floor, one in fit.selection.items()},
     ),
     "slip_by_torque": lambda fit, data, measured: curve_figure(fit, measured),
@@ -181,6 +182,8 @@ def validate_plots(fit: Fit, data: Runs, found: Validation, out: Path) -> list[P
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {
         "validation_errors": found.plot(),
-        "validation_paths": path_figure(fit.robot, fit.tracks, data, order, PATHS + found.which),
+        "validation_paths": path_figure(
+            fit.robot, fit.tracks, data, order, PATHS + found.which, fit.config_shape
+        ),
     }
     return save_all(figures, out)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
+from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.plots import drawing
 from slipid.plots.measured_windows import MeasuredWindows, by_heading
@@ -117,6 +118,7 @@ def path_figure(
     data: Runs,
     order: Sequence[tuple[str, str]],
     title: str,
+    shape: Geometry,
     errors: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
     """Draw measured and predicted paths of some runs, one panel per floor and load set-up.
@@ -129,12 +131,13 @@ def path_figure(
         data: the runs.
         order: (floor, load set-up) of the panels in order.
         title: title of the figure, which names the set of runs.
+        shape: geometry with the lengths of the config, by which the encoders' paths are drawn.
         errors: text about prediction errors under a panel's name, keyed by floor; by default the
             mean end-point errors of the drawn floor's runs.
     """
     groups = runs_by_setup(data)
     names = [name for name in order if name in groups]
-    paths = _paths(robot, predict, data)
+    paths = _paths(robot, predict, data, shape)
     made, axes = drawing.panels(len(names), 3.7, 4.3, title)
     for ax, (surface, load) in zip(axes, names, strict=True):
         runs = groups[surface, load]
@@ -150,7 +153,9 @@ def path_figure(
     handles = [
         axes[0].plot([], [], color=drawing.INK, lw=3.2, alpha=0.35, label="camera")[0],
         axes[0].plot([], [], color=drawing.BLUE, lw=1.4, marker="o", ms=4, label="predicted")[0],
-        axes[0].plot([], [], ":", color=drawing.ORANGE, lw=1.2, label="only encoders")[0],
+        axes[0].plot(
+            [], [], ":", color=drawing.ORANGE, lw=1.2, label="encoders, lengths of the config"
+        )[0],
     ]
     made.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return made
@@ -183,14 +188,14 @@ class _Paths(NamedTuple):
 
 
 def _paths(
-    robot: Robot, predict: Callable[[Windows], replay.Tracks], data: Runs
+    robot: Robot, predict: Callable[[Windows], replay.Tracks], data: Runs, shape: Geometry
 ) -> dict[int, _Paths]:
     """Return the paths of every run, keyed by the run's index."""
     out: dict[int, _Paths] = {}
     for w in replay.replay_windows(data, robot):
         tracks = predict(w)
         encoder = replay.tracks_from_increments(
-            robot, w, FloorModels(Encoder()).increments(w, robot)
+            robot, w, FloorModels(Encoder(shape=shape)).increments(w, robot)
         )
         for n, k in enumerate(tracks.run):
             yaw = float(robot.camera.yaw(jnp.asarray(robot.session_index(w.session[n]))))

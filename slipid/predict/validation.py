@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "slipid.validation/1"
+CONTACT = "identified"
+"""Name of the force balance's scores."""
 SAME_LAG_S = 0.005
 """Largest difference of two lags for which windows cut for one lag serve for the other [s]."""
 
@@ -129,7 +131,7 @@ class Validation:
 
 
 def validation(
-    fit: ForceBalance,
+    fit: ForceBalance | None,
     models: Sequence[FloorModels],
     data: Runs,
     new: int = 0,
@@ -143,7 +145,7 @@ def validation(
     session were fitted. A run begins at its first pose after the wheels have moved by 10 mm.
 
     Args:
-        fit: the force balance.
+        fit: the force balance; None where only kinematics were calibrated.
         models: other slip models, fitted floor by floor.
         data: runs on known floors.
         new: number of the runs that were not fitted.
@@ -155,13 +157,16 @@ def validation(
     Raises:
         DataError: the floor or the load set-up of a run was not identified.
     """
-    _known(fit.robot, data)
+    own = seen if seen is not None or fit is None else fit.robot
+    assert own is not None, "a robot with a pose sensor is needed where there is no force balance"
+    _known(own, data)
     runs: dict[int, ScoredRun] = {}
-    own = fit.robot if seen is None else seen
-    cuts = replay.replay_windows(data, fit.robot)
-    for w in cuts:
-        add_scores(runs, data, fit.name, *fit.ends(w))
-    if abs(float(own.camera.lag - fit.robot.camera.lag)) > SAME_LAG_S:
+    robot = own if fit is None else fit.robot
+    cuts = replay.replay_windows(data, robot)
+    if fit is not None:
+        for w in cuts:
+            add_scores(runs, data, fit.name, *fit.ends(w))
+    if abs(float(own.camera.lag - robot.camera.lag)) > SAME_LAG_S:
         cuts = replay.replay_windows(data, own)
     for w in cuts:
         late = w.at_lag(float(own.camera.lag))
@@ -170,7 +175,7 @@ def validation(
             add_scores(runs, data, model.name, tracks, None)
     for run in runs.values():
         if name := chosen.get(run.surface):
-            run.models["selected"] = run.models[fit.name if name == "contact" else name]
+            run.models["selected"] = run.models[CONTACT if name == "contact" else name]
     return Validation(tuple(runs[k] for k in range(len(data))), new)
 
 

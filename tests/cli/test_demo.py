@@ -146,7 +146,8 @@ def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_pa
         config, tmp_path / "recorded" / "unseen" / "logs", Reporter(quiet=True)
     ).dataset
     order = [("firm", "as_built"), ("soft", "as_built"), ("soft", "moved")]
-    drawn = path_figure(done.fit.robot, done.fit.tracks, data, order, "unseen runs").axes
+    fit = done.fit
+    drawn = path_figure(fit.robot, fit.tracks, data, order, "unseen runs", fit.config_shape).axes
     for ax, floor in zip(drawn, ("firm", "soft", "soft@moved"), strict=False):
         by = found["summary"][floor]
         mine = 100 * by["selected"]["endpoint_error_over_path_mean"]

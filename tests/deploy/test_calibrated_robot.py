@@ -89,3 +89,14 @@ def test_runs_without_whole_poses_are_calibrated_alone(name, tmp_path):
     low, high = content["calibration"]["surfaces"][floor]["effective_track_m"]["interval90"]
     assert low < robot.floors[0].base < high
     assert DeployedRobot.load(tmp_path / "out" / "robot.json").calibrated == (True,)
+
+
+def test_it_predicts_other_runs_without_a_force_balance(calibrated, tmp_path):
+    folder, out, *_ = calibrated
+    file = tmp_path / "validation.json"
+    done = invoke("validate", out, "--data", folder / "fresh", "--json", file, "--quiet")
+    assert done.exit_code == 0, done.stderr
+    rows = json.loads(file.read_text())["summary"]["floor"]
+    assert list(rows) == ["nominal", "calibrated", "selected"]
+    error = {name: row["endpoint_error_over_path_mean"] for name, row in rows.items()}
+    assert error["selected"] == error["calibrated"] < 0.1 * error["nominal"]

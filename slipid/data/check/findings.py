@@ -76,6 +76,36 @@ def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(f for f in findings if f.severity == "wrong")
 
 
+NOT_CALIBRATED = frozenset(
+    (
+        *("no_motion", "wheel_sign", "wheel_order", "wheel_azimuths", "wheel_columns"),
+        *("heading_constant", "heading_sign", "heading_unit", "heading_offset"),
+        *("heading_quaternion", "pose_axis", "pose_swapped", "pose_mirrored", "pose_constant"),
+        *("pose_of_another_run", "pose_unexplained", "steering_sign"),
+    )
+)
+"""Kinds of findings about order, signs, axes and missing motion, with which calibrated lengths
+would be meaningless."""
+
+
+def heading_constant(turned: float, runs: Sequence[str], count: int) -> Finding:
+    """Return the finding that the heading of the poses never changes in runs that turn.
+
+    Args:
+        turned: usual range of the heading that the wheels turn the robot by in such a run [rad].
+        runs: names of these runs.
+        count: number of all runs.
+    """
+    return Finding(
+        "heading_constant",
+        f"the heading of the poses never changes in {len(runs)} of {count} runs, although the "
+        f"wheels turn the robot by {turned:.2g} rad",
+        "check that the channel pose_heading names the column of the heading; if no heading was "
+        "measured, remove pose_heading from the layout, since positions alone suffice",
+        runs=() if len(runs) == count else tuple(runs),
+    )
+
+
 _CONVENTION_SENTENCES = {
     "heading_sign": "the heading of the poses turns in the opposite direction of the body",
     "pose_axis": "an axis of the poses has the wrong sign",
@@ -147,6 +177,12 @@ def _sign_finding(kind: str, sign: Sequence[int], commanded: str) -> Finding:
 def _order_finding(kind: str, order: Sequence[int], columns: str) -> Finding:
     """Return the finding that columns are in a wrong order; `columns` describes them in words."""
     listed = ", ".join(str(k + 1) for k in order)
+    if len(order) == 2:
+        return Finding(
+            kind,
+            f"left and right seem to be exchanged in {columns}",
+            "exchange the two columns in the layout: [left, right] becomes [right, left]",
+        )
     return Finding(
         kind,
         f"{columns} are in another order than the wheels of [robot]",
@@ -286,7 +322,7 @@ def _factor_finding(cause: ScaleCause, gear_ratio: float, reading: WheelReading)
         turns = _turns(factor, gear_ratio, reading)
         remedy = f"divide wheel_radius_m in [robot] by {factor:.3g}, or {turns}"
     elif kind == "wheel_scale":
-        remedy = _turns(factor, gear_ratio, reading)
+        remedy = f"{_turns(factor, gear_ratio, reading)}, or correct wheel_radius_m in [robot]"
     elif cause.name == "base":
         found = (
             f"{channel} is {'more' if factor > 1 else 'less'} than declared, by a factor of {ratio}"

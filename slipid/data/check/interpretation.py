@@ -210,9 +210,10 @@ def _unexplained(
     """Return the fraction of the body's motion that the prediction does not explain.
 
     The prediction has a fitted factor for each axis. Translation and rotation are weighted by the
-    mean of their fractions of the motion in the prediction and in the poses, so that lengths in a
-    wrong unit hide neither of them. Wheels that do not determine the twist (`free` is False)
-    determine only one direction of translation, which has a single factor.
+    mean of their fractions of the rms motion in the prediction and in the poses, so that lengths in
+    a wrong unit hide neither of them. Fractions of the squared motion would hide the short turns
+    between long straight legs. Wheels that do not determine the twist (`free` is False) determine
+    only one direction of translation, which has a single factor.
 
     Args:
         sums: products of turns and body increments.
@@ -232,8 +233,14 @@ def _unexplained(
         explained[:2] = 0.5 * max(both[:2].sum(), 0.0) ** 2 / predicted[:2].sum()
     along = 1.0 - explained[:2].sum() / max(measured[:2].sum(), 1e-300)
     about = 1.0 - explained[2] / max(measured[2], 1e-300)
-    share = 0.5 * (predicted[2] / total + measured[2] / measured.sum())
+    share = 0.5 * (_share_of_rotation(predicted) + _share_of_rotation(measured))
     return float((1 - share) * along + share * about)
+
+
+def _share_of_rotation(squares: Float[np.ndarray, "3"]) -> float:
+    """Return the fraction of the rms motion that is rotation, from sums of squares per axis."""
+    ahead, about = np.sqrt(np.array([squares[:2].sum(), squares[2]]).clip(0))
+    return float(about / (ahead + about))
 
 
 def _beyond_rigid(

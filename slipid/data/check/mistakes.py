@@ -132,7 +132,8 @@ def _conventions(current: Interpretation) -> Iterator[Candidate]:
     for quarter in (0, 90, 180, -90):
         more = 0.0 if quarter == 0 else 0.02
         yield other("heading_sign", more, PoseConvention("turned_round", False, quarter))
-        yield other("pose_mirrored", more, PoseConvention("turned_round", True, quarter))
+        # On two wheels, exchanged columns look the same as mirrored poses, and are likelier.
+        yield other("pose_mirrored", 0.002 + more, PoseConvention("turned_round", True, quarter))
         kind = "pose_swapped" if abs(quarter) == 90 else "pose_axis"
         cost = 0.005 if quarter == 180 else 0.0
         yield other(kind, cost, PoseConvention("as_logged", True, quarter))

@@ -4,12 +4,13 @@ Encoders, commands, gyro, currents and poses must agree with each other and with
 config. Single runs are searched for constant poses and for poses of another run.
 
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_ticks`,
-`wheel_speed_unit`, `heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`,
-`pose_axis`, `pose_swapped`, `pose_mirrored`, `pose_length`, `pose_constant`, `pose_of_another_run`,
-`pose_unexplained`, `lag`, `base_radius`, `time_unit`, `current_sign`, `current_order`,
-`current_unit`, `current_of_supply`, `voltage_sign`, `voltage_order`, `voltage_unit`, `gyro_sign`,
-`gyro_unit`, `command_sign`, `command_order`, `command_unit`, `command_exchanged`, `wheel_columns`,
-`scales`, `travel`, `steering_sign`, `steering_scale`, `not_checked`.
+`wheel_speed_unit`, `no_motion`, `heading_constant`, `heading_sign`, `heading_unit`,
+`heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`, `pose_mirrored`, `pose_length`,
+`pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`, `base_radius`, `time_unit`,
+`current_sign`, `current_order`, `current_unit`, `current_of_supply`, `voltage_sign`,
+`voltage_order`, `voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`, `command_order`,
+`command_unit`, `command_exchanged`, `wheel_columns`, `scales`, `travel`, `steering_sign`,
+`steering_scale`, `not_checked`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -29,6 +30,7 @@ from slipid.data.check.columns import (
 from slipid.data.check.findings import (
     Finding,
     cause_findings,
+    heading_constant,
     mistake_finding,
     ticks_finding,
     worst_first,
@@ -58,6 +60,7 @@ from slipid.data.check.ratios import (
 )
 from slipid.data.check.steered import steered_findings
 from slipid.data.runs import Runs
+from slipid.data.wheel_signals import MOVED_M
 from slipid.model.geometry import Geometry
 
 FEWEST_STEPS = 20
@@ -76,6 +79,9 @@ time is smaller than declared."""
 FAST_M_S, FAST_ROW_S = 50.0, 1e-3
 """If the rim speed [m/s] is above and the time between rows [s] below these values, the unit of
 time is larger than declared."""
+STILL_RAD = 1.0
+"""Wheels do not turn if no angle changes by this angle [rad], nor any rim moves by `MOVED_M`; the
+radius alone does not tell, since it may be in a wrong unit."""
 SHORT_TRAVEL = 0.62
 """Ratio of the body's path length to that of the wheels below which there is a finding if no
 command confirms the wheels [1]."""
@@ -108,13 +114,47 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
         geometry: declared geometry of the robot.
         mass_kg: mass of the robot [kg], or None if it is unknown.
     """
+    still = tuple(_no_motion(data, float(geometry.wheel_radius)))
+    if still and not still[0].runs:
+        return still
     if geometry.driven is not None:
-        return worst_first(steered_findings(data, geometry))
-    found = tuple(_all(data, geometry, mass_kg))
+        return worst_first([*still, *steered_findings(data, geometry)])
+    found = (*still, *_all(data, geometry, mass_kg))
     if not {finding.kind for finding in found} & {*MADE_REDUNDANT_BY}:
         columns = tuple(misordered(data.logs))
         found = tuple(f for f in found if not columns or f.kind not in CAUSED_BY_ORDER) + columns
     return worst_first(found)
+
+
+def _no_motion(runs: Runs, radius: float) -> Iterator[Finding]:
+    """Yield the finding that no wheel turns in any run, or in runs whose poses move.
+
+    `radius` is that of the wheels [m].
+    """
+    turned = np.array([np.ptp(log.wheel_angle, axis=0).max(initial=0.0) for log in runs.logs])
+    still = (turned < STILL_RAD) & (radius * turned < MOVED_M)
+    moved = np.zeros(len(runs))
+    for run in np.flatnonzero(still).tolist():
+        place = runs.pose[runs.rows(run), :2]
+        place = place[np.isfinite(place).all(axis=1)]
+        moved[run] = np.hypot(*np.ptp(place, axis=0)) if len(place) else 0.0
+    every = bool(still.all())
+    if not every:
+        still &= moved > LEAST_PATH_M
+    if not still.any():
+        return
+    names = () if every else tuple(runs.logs[k].name for k in np.flatnonzero(still))
+    most = float(moved[still].max())
+    poses = f", although the poses move by up to {most:.2g} m" if most > MOVED_M else ""
+    where = "these runs" if every else f"{len(names)} of {len(runs)} runs"
+    channel = runs.logs[0].wheel_reading.channel or "of the wheels"
+    yield Finding(
+        "no_motion",
+        f"no wheel turns in {where}{poses}",
+        f"check that the channel {channel} names the columns of the encoders and that these count, "
+        + ("or log runs in which the robot drives" if every else "or exclude these runs"),
+        runs=names,
+    )
 
 
 def _all(runs: Runs, geometry: Geometry, mass_kg: float | None) -> Iterator[Finding]:
@@ -166,13 +206,16 @@ def _compared(
     if declared.still.all():
         return _Compared(tuple(single_runs(data, declared)), moved, evidence)
     meant, found = mistakes(evidence)
+    agreeing = agreement(data, at, moved, evidence, meant)
+    fixed = agreeing.heading_fixed
+    if fixed.any() and fixed.mean() >= SHARE_IF_ALL:  # no order or axis can be told without it
+        return _Compared((_heading_constant(data, agreeing),), moved, evidence)
     left = misfits(evidence, meant)["pose"]
     if left > UNEXPLAINED_IF_FOREIGN:
         return _Compared((_foreign(left),), moved, evidence)
     # Findings about single runs are omitted if the logged heading is sin(heading / 2): it does not
     # determine the heading beyond half a turn, so that correct runs may seem to disagree.
     half_sine = meant.convention.heading == "half_sine"
-    agreeing = agreement(data, at, moved, evidence, meant)
     alone = () if half_sine else tuple(single_runs(data, agreeing))
     listed = (*_of_lag(lag), *map(mistake_finding, found), *alone)
     return _Compared(listed, moved, evidence, meant, True)
@@ -283,6 +326,9 @@ LEAST_PATH_M = 0.2
 [m]."""
 ROUNDING_M = 1e-6
 """Poses with a path shorter than this are constant, except for rounding [m]."""
+LEAST_TURN_RAD, ROUNDING_RAD = 0.5, 1e-6
+"""A run's heading is judged if the wheels turn the robot by more than the first angle, and is
+constant if its range is below the second one [rad]."""
 LEAST_ROWS = 20
 """Runs with fewer rows are not judged."""
 ODD_DISAGREEMENT, ODD_RATIO, USUAL_COSINE = 0.3, 10.0, 0.9
@@ -309,17 +355,27 @@ class RunAgreement:
             (run,) [1].
         judged: True if the run has enough rows, and its wheels travel far enough, to be judged
             (run,).
+        wheels_rad: range of the heading predicted from the wheels (run,) [rad].
+        poses_rad: range of the heading of the poses (run,) [rad].
     """
 
     wheels_m: Float[np.ndarray, " run"]
     poses_m: Float[np.ndarray, " run"]
     cosine: Float[np.ndarray, " run"]
     judged: Bool[np.ndarray, " run"]
+    wheels_rad: Float[np.ndarray, " run"]
+    poses_rad: Float[np.ndarray, " run"]
 
     @property
     def still(self) -> Bool[np.ndarray, " run"]:
         """Return, for each run, whether its poses are constant although its wheels turn."""
         return self.judged & (self.poses_m < ROUNDING_M)
+
+    @property
+    def heading_fixed(self) -> Bool[np.ndarray, " run"]:
+        """Return, for each run, whether its heading is constant although its wheels turn it."""
+        turns = self.judged & ~self.still & (self.wheels_rad > LEAST_TURN_RAD)
+        return turns & (self.poses_rad < ROUNDING_RAD)
 
 
 def agreement(
@@ -331,6 +387,12 @@ def agreement(
 ) -> RunAgreement:
     """Return the agreement of poses with wheels in every run, under an interpretation."""
     convention = meant.convention
+    # Not shifted by the lag of the poses, which cannot be told from a constant heading.
+    turned = increments(data, at, 0.0).wheels @ to_body(evidence, meant)[2] / evidence.base
+    wheels_rad, poses_rad = (
+        np.array([_range(of[at.run == k]) for k in range(len(data.names))])
+        for of in (turned, at.pose_after[:, 2] - at.pose_before[:, 2])
+    )
     body = body_motion(at, convention.bare) * [1.0, 1.0, evidence.base]
     body = body @ rotation(-convention.offset).T
     predicted = moved.wheels @ to_body(evidence, meant).T
@@ -357,7 +419,21 @@ def agreement(
         total(np.linalg.norm(body, axis=1)),
         np.where(size > 0, both / np.where(size > 0, size, 1.0), 0.0),
         (rows >= LEAST_ROWS) & (wheels_m > LEAST_PATH_M),
+        wheels_rad,
+        poses_rad,
     )
+
+
+def _range(increments: Float[np.ndarray, " step"]) -> float:
+    """Return the range of the sum of increments, 0 if there are none."""
+    return float(np.ptp(np.nancumsum(increments))) if len(increments) else 0.0
+
+
+def _heading_constant(data: JoinedRuns, compared: RunAgreement) -> Finding:
+    """Return the finding about the runs whose heading is constant although they turn."""
+    fixed = compared.heading_fixed
+    turned = float(np.median(compared.wheels_rad[fixed]))
+    return heading_constant(turned, _names(data, fixed), len(fixed))
 
 
 def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
@@ -374,8 +450,11 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             else "exclude these runs from the globs of [[logs]]",
             runs=() if every else _names(data, still),
         )
+    fixed = compared.heading_fixed
+    if fixed.any():
+        yield _heading_constant(data, compared)
     # Runs in which the robot slips in place disagree for a good reason, and are not judged.
-    moves = compared.judged & ~still
+    moves = compared.judged & ~still & ~fixed
     if moves.any():
         share = compared.poses_m / np.maximum(compared.wheels_m, 1e-300)
         moves &= share > 0.25 * np.median(share[moves])

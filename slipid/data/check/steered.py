@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.align.lag import pose_lag
-from slipid.data.check.findings import Finding
+from slipid.data.check.findings import Finding, heading_constant
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_steps, integral, interpolate
 from slipid.model.geometry import Geometry
@@ -15,6 +15,9 @@ STEP_S = 0.2
 """Shortest duration of the compared pose increments [s]."""
 LEAST_CORRELATION = 0.5
 """Smallest magnitude of the correlation of two motions at which their ratio is judged [1]."""
+LEAST_TURN_RAD, ROUNDING_RAD = 0.5, 1e-6
+"""If wheels and steering turn the robot by more than the first angle [rad], and the heading of the
+poses by less than the second one, the heading is constant."""
 NATURAL = 0.67, 1.5
 """Range of the ratio of the poses' motion to that of wheels and steering without a finding [1]."""
 
@@ -24,6 +27,11 @@ def steered_findings(data: Runs, shape: Geometry) -> Iterator[Finding]:
     lag = pose_lag(data)
     late = lag.seconds if lag is not None and lag.decisive else 0.0
     parts = [_motions(data, run, shape, late) for run in range(len(data))]
+    spans = [np.ptp(np.cumsum(part[:, 1::2], axis=0), axis=0) for part in parts if len(part)]
+    logged, expected = np.max(np.reshape(spans, (-1, 2)), axis=0, initial=0.0)
+    if logged < ROUNDING_RAD and expected > LEAST_TURN_RAD:
+        yield heading_constant(float(expected), [log.name for log in data.logs], len(data))
+        return
     ahead, turned, rolled, steered = np.concatenate(parts).T
     travel, turning = _ratio(ahead, rolled), _ratio(turned, steered)
     if turning is not None and travel is not None:

@@ -1,0 +1,213 @@
+"""Logs that tell little, or that contradict the config, are answered by a sentence each."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+from slipid.app.calibrate import calibrated, remarks
+from slipid.app.check import calibration_part, overview, sanity
+from slipid.app.config import read_config
+from slipid.app.problem import ConfigFitTask, read_fit_task
+from slipid.predict.selection import selected
+from slipid.support.progress import Reporter
+from tests.benchmarks.every_robot.drive import commands, config, driven, table, write_csv
+from tests.benchmarks.every_robot.robots import ROBOTS, MadeRobot
+from tests.helpers.shared import invoke
+
+Columns = dict[str, np.ndarray]
+ROWS = 600
+"""Rows of every run, equal so that all calibrations share what is compiled."""
+NAMED = {robot.name: robot for robot in ROBOTS}
+SQUARES = replace(NAMED["diff_umbmark"], runs=2)
+"""Two wheels on squares, both ways, at one speed."""
+MIXED = replace(NAMED["diff_right"], runs=2)
+"""Two wheels on lines, arcs and turns on the spot, at several speeds."""
+STRAIGHT = replace(NAMED["diff_straight"], runs=2)
+"""Two wheels that never turn the robot."""
+STEERED = replace(NAMED["bicycle_zero"], runs=2)
+
+
+@cache
+def tables(robot: MadeRobot) -> list[Columns]:
+    rng = np.random.default_rng(0)
+    runs = [driven(robot, robot.floors[0], commands(robot, rng, k, False), rng) for k in range(2)]
+    return [{k: v[:ROWS] for k, v in table(robot, run, rng).items()} for run in runs]
+
+
+def write(
+    folder: Path,
+    robot: MadeRobot,
+    spoil: Callable[[Columns, int], Columns] = lambda columns, run: columns,
+    radius: float = 1.0,
+    order: tuple[int, ...] = (),
+) -> Path:
+    """Write logs of a robot, spoilt, and its config with a wrong radius or order of columns."""
+    for k, columns in enumerate(tables(replace(robot, runs=2))[: robot.runs]):
+        write_csv(folder / "logs" / robot.floors[0].name / f"{k}.csv", spoil(columns, k))
+    text = config(replace(robot, nominal_radius=radius * robot.nominal_radius))
+    (listed,) = re.findall(r"columns = \[(.*?)\]", text)
+    names = listed.split(", ")
+    swapped = ", ".join(names[k] for k in order or range(len(names)))
+    (folder / "robot.toml").write_text(text.replace(listed, swapped), encoding="utf-8")
+    return folder / "robot.toml"
+
+
+def task_of(*made, **spoilt) -> ConfigFitTask:
+    with TemporaryDirectory() as folder, Reporter(quiet=True) as report:
+        file = write(Path(folder), *made, **spoilt)
+        return read_fit_task(read_config(file), file.parent / "logs", report)
+
+
+def alarms(task):
+    return [f for f in sanity(task) if f.severity != "note"]
+
+
+@cache
+def judged(robot: MadeRobot, radius: float = 1.0):
+    """A calibration of sound runs with its remarks."""
+    task = task_of(robot, radius=radius)
+    found = calibrated(task, Reporter(quiet=True))
+    selection = selected(task.dataset, found.errors, found.contradicted)
+    return found.calibration, "\n".join(remarks(found, selection, task))
+
+
+def still(columns: Columns, run: int, which: tuple[int, ...] = (0, 1)) -> Columns:
+    wheels = {k: np.full_like(v, v[0]) for k, v in columns.items() if k in ("left", "right")}
+    return columns | (wheels if run in which else {})
+
+
+def one_heading(columns: Columns, run: int) -> Columns:
+    return columns | {"heading": np.full_like(columns["heading"], columns["heading"][0])}
+
+
+def one_heading_first(columns: Columns, run: int) -> Columns:
+    return one_heading(columns, run) if run == 0 else columns
+
+
+def test_wheels_that_never_turn_are_named_with_their_channel():
+    (found,) = alarms(task_of(SQUARES, still))
+    assert found.kind == "no_motion"
+    assert re.search(
+        r"no wheel turns in these runs, although the poses move by up to \d", str(found)
+    )
+    assert "the channel wheel_ticks names the columns" in str(found)
+
+
+def test_a_run_whose_wheels_do_not_count_is_named():
+    (found,) = alarms(task_of(SQUARES, lambda columns, run: still(columns, run, (1,))))
+    assert (found.kind, found.runs) == ("no_motion", ("floor/1.csv",))
+    assert "no wheel turns in 1 of 2 runs, although the poses move" in found.found
+
+
+def test_a_robot_at_rest_is_not_said_to_move():
+    def parked(columns: Columns, run: int) -> Columns:
+        return {k: np.full_like(v, v[0]) if k != "t" else v for k, v in columns.items()}
+
+    (found,) = alarms(task_of(SQUARES, parked))
+    assert found.kind == "no_motion"
+    assert "although" not in found.found
+
+
+@pytest.mark.parametrize("robot", [SQUARES, NAMED["omni3_right"], STEERED], ids=lambda r: r.drive)
+def test_a_heading_that_never_changes_is_named_where_wheels_turn_the_robot(robot):
+    (found,) = alarms(task_of(replace(robot, runs=2), one_heading))
+    assert found.kind == "heading_constant"
+    assert "never changes in 2 of 2 runs, although the wheels turn the robot by" in found.found
+    assert "pose_heading names the column of the heading" in (found.remedy or "")
+    assert found.runs == ()
+
+
+def test_one_run_with_a_constant_heading_is_named():
+    found = alarms(task_of(SQUARES, one_heading_first))
+    assert [f.kind for f in found] == ["heading_constant"]
+
+
+def test_a_constant_heading_of_a_robot_that_never_turns_is_right():
+    assert alarms(task_of(STRAIGHT, one_heading)) == []
+
+
+@pytest.mark.parametrize("radius", [1 / 1.5, 1.0, 1.5])
+@pytest.mark.parametrize("robot", [SQUARES, MIXED], ids=lambda r: r.name)
+def test_exchanged_wheels_are_named_whatever_the_radius(robot, radius):
+    first, *_ = alarms(task_of(robot, radius=radius, order=(1, 0)))
+    assert first.kind == "wheel_order"
+    assert first.found.startswith("left and right seem to be exchanged in the wheels' columns")
+    assert "[left, right] becomes [right, left]" in (first.remedy or "")
+
+
+@pytest.mark.parametrize("radius", [1 / 1.5, 1.5])
+@pytest.mark.parametrize(
+    ("name", "order", "says"),
+    [("omni3_right", (1, 2, 0), "3, 1, 2"), ("mecanum_wrong_base", (0, 1, 3, 2), "1, 2, 4, 3")],
+)
+def test_permuted_wheels_are_named_whatever_the_radius(name, order, says, radius):
+    first, *rest = alarms(task_of(replace(NAMED[name], runs=2), radius=radius, order=order))
+    assert first.kind == "wheel_order"
+    assert [f.kind for f in rest] == ([] if radius > 1 else ["wheel_scale"])
+    assert all("correct wheel_radius_m in [robot]" in (f.remedy or "") for f in rest)
+    assert f"list the columns in the order {says} " in (first.remedy or "")
+
+
+def test_without_a_turn_the_order_of_two_wheels_is_not_judged():
+    assert alarms(task_of(STRAIGHT, order=(1, 0))) == []
+
+
+def test_a_wrong_radius_alone_is_calibrated():
+    calibration, said = judged(MIXED, 1.5)
+    assert calibration.radius["floor"][0].value == pytest.approx(0.05, rel=5e-3)
+    assert calibration.radius["floor"][0].verdict == "identified"
+    assert "the wheel radius in the config is 75 mm; on floor it is 49.98 mm" in said
+
+
+def test_lengths_far_from_the_config_do_not_count_as_identified():
+    calibration, said = judged(MIXED, 4.0)
+    assert {v.verdict for v in calibration.radius["floor"]} == {"not_identified"}
+    assert re.search("the wheel radius comes out 0.2[0-9]* times as large as in the config", said)
+    assert "the wheel radius in the config is" not in said
+
+
+@pytest.mark.slow
+def test_one_run_is_said_to_be_one():
+    assert "on floor one run alone" in judged(replace(SQUARES, runs=1))[1]
+    assert "one run alone" not in judged(MIXED)[1]
+
+
+def test_without_turns_the_track_is_not_identified():
+    calibration, said = judged(STRAIGHT)
+    assert calibration.base["floor"].verdict == "not_identified"
+    assert calibration.base["floor"].value == pytest.approx(STRAIGHT.nominal_base)
+    assert "no run turns: the effective track and the place of the pose sensor" in said
+    assert "no run turns" not in judged(MIXED)[1]
+
+
+def test_one_speed_is_said_with_what_it_does_not_tell():
+    said = judged(SQUARES)[1]
+    assert "one speed alone on floor (0.2 m/s): whether slip grows with speed" in said
+    assert "nearly one number" not in said
+    assert "one speed" not in judged(MIXED)[1]
+
+
+def test_one_speed_without_headings_mixes_lag_and_place():
+    said = judged(replace(SQUARES, pose_kind="xy"))[1]
+    assert "the lag of the poses and the place of their sensor ahead are nearly one number" in said
+
+
+def test_check_does_not_calibrate_exchanged_wheels():
+    task = task_of(SQUARES, radius=1.5, order=(1, 0))
+    same, part = calibration_part(task, overview(task)["findings"], Reporter(quiet=True))
+    assert same is task
+    assert part == {"suspects": ["no calibration before the findings marked wrong are corrected"]}
+
+
+def test_identify_refuses_wheels_that_never_turn(tmp_path):
+    file = write(tmp_path, SQUARES, still)
+    words = ("--data", tmp_path / "logs", "--out", tmp_path / "out", "--only", "calibration")
+    result = invoke("identify", file, *words)
+    assert result.exit_code == 2
+    assert "no wheel turns in these runs" in result.stderr
