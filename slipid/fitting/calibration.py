@@ -64,7 +64,7 @@ IDENTIFIED, WEAK = 0.3, 0.8
 ABSURD = 3.0
 """Ratio of a calibrated length to the config's, or its inverse, from which on the length counts as
 not identified: the logs and the config must then contradict each other [1]."""
-RADIUS_STD, DRIVE_STD, FLOOR_STD, DRIVE_ON_FLOOR_STD, BASE_STD = 0.3, 0.05, 0.3, 0.03, 0.5
+RADIUS_STD, DRIVE_STD, FLOOR_STD, DRIVE_ON_FLOOR_STD, BASE_STD = 0.3, 0.02, 0.3, 0.03, 0.5
 """Prior stds of the logarithms of the radius, of the drives' deviations from it, of a floor's
 radius over that of the firmest floor, of the drives' further deviations on a floor, and of the
 track or base over the config's [1]."""
