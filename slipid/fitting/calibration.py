@@ -62,8 +62,9 @@ Verdict = Literal["identified", "weak", "not_identified", "fixed"]
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior) for the verdicts `identified` and `weak`."""
 ABSURD = 3.0
-"""Ratio of a calibrated length to the config's, or its inverse, from which on the length counts as
-not identified: the logs and the config must then contradict each other [1]."""
+"""Ratio of a calibrated length on the firmest floor to the config's, or its inverse, from which on
+the length counts as not identified, on other floors as well: the logs and the config must then
+contradict each other [1]. On a floor on which the wheels slip, such a ratio is natural."""
 RADIUS_STD, DRIVE_STD, FLOOR_STD, DRIVE_ON_FLOOR_STD, BASE_STD = 0.3, 0.02, 0.3, 0.03, 0.5
 """Prior stds of the logarithms of the radius, of the drives' deviations from it, of a floor's
 radius over that of the firmest floor, of the drives' further deviations on a floor, and of the
@@ -922,13 +923,22 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
     count = len(changes)
     off = changes - changes.mean(axis=0)
 
-    def value(names: Sequence[str], unit: str, log_of: float | None = None) -> Value:
+    def total(names: Sequence[str]) -> float:
+        return sum(float(model.column(name, z)) for name in names)
+
+    def is_far(names: Sequence[str]) -> bool:
+        """Return whether a length is far from the config's; the names are those of its parts."""
+        return abs(total(names)) > np.log(ABSURD)
+
+    def value(
+        names: Sequence[str], unit: str, log_of: float | None = None, far: bool = False
+    ) -> Value:
         """Return the sum of some coordinates, or the exponential of the sum, times `log_of`."""
         w = np.array([float(name in names) for name in model.free])
         stds = {name: model.numbers[name].std for name in names if name in model.numbers}
         prior = float(np.hypot.reduce([*stds.values()], initial=0.0))
         hidden = [std for name, std in stds.items() if name in model.unseen]
-        at = sum(float(model.column(name, z)) for name in names)
+        at = total(names)
         influence = (off @ w) ** 2
         jackknife = (count - 1) / count * float(influence.sum())
         std = float(np.sqrt(max(float(w @ covariance @ w), jackknife)))
@@ -942,7 +952,7 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         ends = at - half, at + half
         if log_of is None:
             return Value(at, ends, std, verdict, unit)
-        if abs(at) > np.log(ABSURD):
+        if far:
             verdict = "not_identified"
         best = log_of * float(np.exp(at))
         low, high = (log_of * float(np.exp(end)) for end in ends)
@@ -950,8 +960,11 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
 
     shape = model.space.template.geometry
     radius, base = float(shape.wheel_radius), nominal_base(shape)
+    firm = model.floors[model.firmest]
+    far_radius = any(is_far(_radius_names(firm, j)) for j in range(shape.drives))
+    far_base = is_far(_base_names(firm))
     steering = {
-        "wheelbase_m": value(_base_names(model.floors[model.firmest]), "m", base),
+        "wheelbase_m": value(_base_names(firm), "m", base, far_base),
         "zero_rad": value(["zero"], "rad"),
         "gain": value(["gain"], "1"),
         "understeer": value(["understeer"], "s^2/m"),
@@ -959,17 +972,19 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
     return Calibration(
         sideways=shape.determines_twist,
         radius={
-            f: tuple(value(_radius_names(f, j), "m", radius) for j in range(shape.drives))
+            f: tuple(
+                value(_radius_names(f, j), "m", radius, far_radius) for j in range(shape.drives)
+            )
             for f in model.floors
         },
-        base={f: value(_base_names(f), "m", base) for f in model.floors},
+        base={f: value(_base_names(f), "m", base, far_base) for f in model.floors},
         centre={f: value([f"centre.{f}"], "m") for f in model.floors if model.has_centre},
         offset=(value(["offset.x"], "m"), value(["offset.y"], "m")),
         yaw=value(["yaw"], "rad"),
         session_yaw={s: float(model.column(f"yaw@{s}", z)) for s in model.sessions},
         lag=value(["lag"], "s"),
         scale=value(["scale"], "1"),
-        firmest=model.floors[model.firmest],
+        firmest=firm,
         steering={} if shape.driven is None else steering,
         gyro={} if rough else _gyro(fit.data, float(model.column("lag", z))),
         nominal_radius=radius,
