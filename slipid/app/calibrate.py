@@ -79,11 +79,8 @@ def remarks(
     c = found.calibration
     out = list(found.suspects)
     what = "base" if c.sideways else "track"
-    straight = [
-        f
-        for f, v in c.base.items()
-        if v.verdict == "not_identified" and not _is_absurd(v.value / c.nominal_base)
-    ]
+    far_base = _is_absurd(c.base[c.firmest].value / c.nominal_base)
+    straight = [f for f, v in c.base.items() if v.verdict == "not_identified" and not far_base]
     if len(straight) == len(c.base):
         out.append(
             f"no run turns: the effective {what} and the place of the pose sensor are not "
@@ -109,8 +106,8 @@ def remarks(
         if _is_absurd(ratio):
             out.append(
                 f"the {name} comes out {ratio:.3g} times as large as in the config, which is not "
-                "to be trusted: check the lengths of [robot], and the columns and units of wheels "
-                "and poses"
+                "to be trusted, unless the wheels really slip that much: check the lengths of "
+                "[robot], and the columns and units of wheels and poses"
             )
         elif abs(ratio - 1) > FAR_FROM_CONFIG and (name != what or not straight):
             out.append(

@@ -62,9 +62,10 @@ Verdict = Literal["identified", "weak", "not_identified", "fixed"]
 IDENTIFIED, WEAK = 0.3, 0.8
 """Largest std(posterior) / std(prior) for the verdicts `identified` and `weak`."""
 ABSURD = 3.0
-"""Ratio of a calibrated length to the config's, or its inverse, from which on the length counts as
-not identified: the logs and the config must then contradict each other [1]."""
-RADIUS_STD, DRIVE_STD, FLOOR_STD, DRIVE_ON_FLOOR_STD, BASE_STD = 0.3, 0.05, 0.3, 0.03, 0.5
+"""Ratio of a calibrated length on the firmest floor to the config's, or its inverse, from which on
+the length counts as not identified, on other floors as well: the logs and the config must then
+contradict each other [1]. On a floor on which the wheels slip, such a ratio is natural."""
+RADIUS_STD, DRIVE_STD, FLOOR_STD, DRIVE_ON_FLOOR_STD, BASE_STD = 0.3, 0.02, 0.3, 0.03, 0.5
 """Prior stds of the logarithms of the radius, of the drives' deviations from it, of a floor's
 radius over that of the firmest floor, of the drives' further deviations on a floor, and of the
 track or base over the config's [1]."""
@@ -87,7 +88,12 @@ LOOSE_SCALE_STD = 0.01
 motion determines only their ratio."""
 WHOLE_TURN, MEAN_TURN = 1.0, 0.3
 """Changes of heading by the encoders that show a track or base: in any run, or on average over the
-runs on a floor [rad]. Smaller ones are errors of the speed controllers, not turns."""
+runs on a floor [rad]."""
+SMALL_TURN, EXPLAINED, LEAST_TURNS = 0.1, 0.8, 6
+"""Smaller changes of heading by the encoders may be errors of the speed controllers or slip. They
+show a track if they exceed this one on average [rad] and explain this fraction of the squares of
+the measured changes [1], in at least this number of runs. They never show the base of wheels that
+determine the twist, whose slip depends on the direction of travel, and so does the turning."""
 DEGREES = 4.0
 """Degrees of freedom of the Student t of runs."""
 LEAST_CLUSTERS = 12
@@ -422,10 +428,8 @@ class _Model:
             numbers["understeer"] = _Number(0.0, UNDERSTEER_STD)
         if not shape.determines_twist and not is_axle(shape):
             numbers |= {f"centre.{f}": _Number(0.0, size) for f in others}
-        place = np.asarray(space.template.camera.marker_place)
-        fixed = _is_fixed(choices, "camera.marker_place")
         for axis, name in enumerate("xy"):
-            numbers[f"offset.{name}"] = _Number(float(place[axis]), 0.0 if fixed else size)
+            numbers[f"offset.{name}"] = _given(space, choices, "camera.marker_place", size, axis)
         numbers["yaw"] = _given(space, choices, "camera.marker_yaw", YAW_STD)
         if len(sessions) > 1:
             numbers |= {f"yaw@{s}": _Number(0.0, SESSION_STD) for s in sessions}
@@ -523,11 +527,32 @@ def _floors_with_turns(space: Space, data: Runs) -> set[str]:
     """Return the floors on which the wheels turned the robot in some run."""
     shape = space.template.geometry
     yaw = np.asarray(shape.pseudo_inverse())[2] * float(shape.wheel_radius)
-    turned: dict[str, list[float]] = {}
+    turned: dict[str, list[tuple[float, float, float]]] = {}
     for k, log in enumerate(data.logs):
-        heading = data.wheel_angle[data.rows(k)] @ yaw
-        turned.setdefault(log.surface or "unknown", []).append(float(np.ptp(heading)))
-    return {f for f, x in turned.items() if max(x) > WHOLE_TURN or np.mean(x) > MEAN_TURN}
+        rows = data.rows(k)
+        seen = np.flatnonzero(data.fresh[rows] & np.isfinite(data.pose[rows, 2]))
+        wheels, poses = data.wheel_angle[rows] @ yaw, np.unwrap(data.pose[rows, 2][seen])
+        ends = (wheels[seen[-1]] - wheels[seen[0]], poses[-1] - poses[0]) if len(seen) else (0, 0)
+        turned.setdefault(log.surface or "unknown", []).append((float(np.ptp(wheels)), *ends))
+    gently = not shape.determines_twist
+    return {floor for floor, each in turned.items() if _shows_turns(np.array(each), gently)}
+
+
+def _shows_turns(turns: Float[np.ndarray, "run 3"], gently: bool) -> bool:
+    """Return whether changes of heading in some runs are turns by the wheels.
+
+    Args:
+        turns: ranges of the heading by the encoders, and its changes from the first to the last
+            pose by the encoders and by the poses [rad].
+        gently: True if small changes may show turns, too.
+    """
+    far, by_wheels, by_poses = turns.T
+    if far.max() > WHOLE_TURN or far.mean() > MEAN_TURN:
+        return True
+    if not gently or len(far) < LEAST_TURNS or far.mean() < SMALL_TURN:
+        return False
+    whole = (by_wheels @ by_wheels) * (by_poses @ by_poses)
+    return bool((by_wheels @ by_poses) ** 2 > EXPLAINED * whole)
 
 
 def _is_fixed(choices: Sequence[Choice], path: str) -> bool:
@@ -536,14 +561,21 @@ def _is_fixed(choices: Sequence[Choice], path: str) -> bool:
     return bool(mine) and (mine[-1].fixed is not None or mine[-1].free is False)
 
 
-def _given(space: Space, choices: Sequence[Choice], path: str, usual: float) -> _Number:
-    """Return the prior of a scalar of the camera: the config's if it has one, else std `usual`."""
+def _given(
+    space: Space, choices: Sequence[Choice], path: str, usual: float, axis: int | None = None
+) -> _Number:
+    """Return the prior of a number of the camera: the config's if it has one, else std `usual`.
+
+    `axis` is the index in a vector, whose declared prior is too narrow and does not count.
+    """
     entry = next(e for e in space.all if e.path == path)
-    value = float(entry.get(space.template))
-    if entry in space.free:
-        at, d = space.slices[path], entry.declaration
-        mean = float(d.to_si(space.prior_mean[at])[0])
-        return _Number(mean, float(space.prior_std[at][0] * d.slope(mean)))
+    at = axis or 0
+    value = float(np.ravel(entry.get(space.template))[at])
+    stated = any(c.prior_std is not None and fnmatchcase(path, c.pattern) for c in choices)
+    if entry in space.free and (stated or axis is None):
+        mine, d = space.slices[path], entry.declaration
+        mean = float(d.to_si(space.prior_mean[mine])[at])
+        return _Number(mean, float(space.prior_std[mine][at] * d.slope(mean)))
     return _Number(value, 0.0 if _is_fixed(choices, path) else usual)
 
 
@@ -698,8 +730,15 @@ class _Fit:
             return total, own + 2 * pull / _TYPICAL_STD
 
         bounds = [(x - 12.0, x + 12.0) for x in typical]
+        # Divided by the slope, the first step of the solver is a step of one; else it overshoots.
+        size = max(float(np.abs(loss(self.log_variance)[1]).max()), 1.0)
+
+        def scaled(v: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope = loss(v)
+            return value / size, slope / size
+
         found = minimize(
-            loss,
+            scaled,
             self.log_variance,
             jac=True,
             method="L-BFGS-B",
@@ -884,13 +923,22 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
     count = len(changes)
     off = changes - changes.mean(axis=0)
 
-    def value(names: Sequence[str], unit: str, log_of: float | None = None) -> Value:
+    def total(names: Sequence[str]) -> float:
+        return sum(float(model.column(name, z)) for name in names)
+
+    def is_far(names: Sequence[str]) -> bool:
+        """Return whether a length is far from the config's; the names are those of its parts."""
+        return abs(total(names)) > np.log(ABSURD)
+
+    def value(
+        names: Sequence[str], unit: str, log_of: float | None = None, far: bool = False
+    ) -> Value:
         """Return the sum of some coordinates, or the exponential of the sum, times `log_of`."""
         w = np.array([float(name in names) for name in model.free])
         stds = {name: model.numbers[name].std for name in names if name in model.numbers}
         prior = float(np.hypot.reduce([*stds.values()], initial=0.0))
         hidden = [std for name, std in stds.items() if name in model.unseen]
-        at = sum(float(model.column(name, z)) for name in names)
+        at = total(names)
         influence = (off @ w) ** 2
         jackknife = (count - 1) / count * float(influence.sum())
         std = float(np.sqrt(max(float(w @ covariance @ w), jackknife)))
@@ -904,7 +952,7 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         ends = at - half, at + half
         if log_of is None:
             return Value(at, ends, std, verdict, unit)
-        if abs(at) > np.log(ABSURD):
+        if far:
             verdict = "not_identified"
         best = log_of * float(np.exp(at))
         low, high = (log_of * float(np.exp(end)) for end in ends)
@@ -912,8 +960,11 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
 
     shape = model.space.template.geometry
     radius, base = float(shape.wheel_radius), nominal_base(shape)
+    firm = model.floors[model.firmest]
+    far_radius = any(is_far(_radius_names(firm, j)) for j in range(shape.drives))
+    far_base = is_far(_base_names(firm))
     steering = {
-        "wheelbase_m": value(_base_names(model.floors[model.firmest]), "m", base),
+        "wheelbase_m": value(_base_names(firm), "m", base, far_base),
         "zero_rad": value(["zero"], "rad"),
         "gain": value(["gain"], "1"),
         "understeer": value(["understeer"], "s^2/m"),
@@ -921,17 +972,19 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
     return Calibration(
         sideways=shape.determines_twist,
         radius={
-            f: tuple(value(_radius_names(f, j), "m", radius) for j in range(shape.drives))
+            f: tuple(
+                value(_radius_names(f, j), "m", radius, far_radius) for j in range(shape.drives)
+            )
             for f in model.floors
         },
-        base={f: value(_base_names(f), "m", base) for f in model.floors},
+        base={f: value(_base_names(f), "m", base, far_base) for f in model.floors},
         centre={f: value([f"centre.{f}"], "m") for f in model.floors if model.has_centre},
         offset=(value(["offset.x"], "m"), value(["offset.y"], "m")),
         yaw=value(["yaw"], "rad"),
         session_yaw={s: float(model.column(f"yaw@{s}", z)) for s in model.sessions},
         lag=value(["lag"], "s"),
         scale=value(["scale"], "1"),
-        firmest=model.floors[model.firmest],
+        firmest=firm,
         steering={} if shape.driven is None else steering,
         gyro={} if rough else _gyro(fit.data, float(model.column("lag", z))),
         nominal_radius=radius,

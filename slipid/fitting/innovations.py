@@ -25,12 +25,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.data.runs import Runs
-from slipid.data.wheel_signals import interpolate
+from slipid.data.wheel_signals import interpolate, refresh_period
 from slipid.model.kinematics import Steering, rolled
 from slipid.support.errors import DataError
 
-POSE_PERIOD_S = 0.2
-"""Shortest time between two poses that are used [s]."""
+POSE_PERIOD_S, LONGEST_PERIOD_S, REFRESHES = 0.2, 1.0, 4
+"""Shortest time between two poses that are used [s]. It is longer, but at most the second number,
+where wheel turns are integrals of speeds that are read less often than rows are logged: this number
+of their refresh periods. Between two readings the turns are not known."""
 LONGEST_GAP_S = 0.8
 """Time between poses above which rows without a pose are added, so that the motion between them is
 computed in short steps [s]."""
@@ -104,7 +106,8 @@ def pose_tracks(
     """
     every = range(len(data)) if runs is None else runs.tolist()
     most = int(np.clip(ALL_POSES // len(every), LEAST_POSES, MOST_POSES))
-    picked = {k: _picked(data, k, lag, most) for k in every}
+    period = _pose_period(data)
+    picked = {k: _picked(data, k, lag, most, period) for k in every}
     rows = {k: _without_gaps(data, k, some, most) for k, some in picked.items()}
     kept = [k for k, some in picked.items() if len(some) > 1]
     if not kept:
@@ -148,8 +151,19 @@ def _size(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def _picked(data: Runs, run: int, lag: float, most: int) -> Int[np.ndarray, " pose"]:
-    """Return the rows of a run whose poses are used, at most `most`."""
+def _pose_period(data: Runs) -> float:
+    """Return the shortest time between two poses that are used [s]."""
+    speeds = [
+        (log.time, log.wheel_speed[:, 0])
+        for log in data.logs
+        if log.wheel_speed is not None and log.wheel_reading.channel.endswith("speed")
+    ]
+    refreshed = refresh_period(speeds) or 0.0
+    return float(np.clip(REFRESHES * refreshed, POSE_PERIOD_S, LONGEST_PERIOD_S))
+
+
+def _picked(data: Runs, run: int, lag: float, most: int, period: float) -> Int[np.ndarray, " pose"]:
+    """Return the rows of a run whose poses are used: at most `most`, every `period` [s] or so."""
     rows = data.rows(run)
     time, fresh = data.time[rows], np.flatnonzero(data.fresh[rows])
     fresh = fresh[np.isfinite(data.pose[rows][fresh]).any(axis=1)]
@@ -160,7 +174,7 @@ def _picked(data: Runs, run: int, lag: float, most: int) -> Int[np.ndarray, " po
     if len(fresh) < 3:
         return fresh
     t = time[fresh]
-    count = int(min(np.floor((t[-1] - t[0]) / POSE_PERIOD_S) + 1, most))
+    count = int(min(np.floor((t[-1] - t[0]) / period) + 1, most))
     at = np.searchsorted(t, np.linspace(t[0], t[-1], max(count, 2)) - 1e-9)
     return fresh[np.unique(at.clip(0, len(t) - 1))]
 

@@ -17,7 +17,7 @@ from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.predict.selection import selected
 from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import commands, config, driven, table, write_csv
-from tests.benchmarks.every_robot.robots import ROBOTS, MadeRobot
+from tests.benchmarks.every_robot.robots import ROBOTS, Floor, MadeRobot
 from tests.helpers.shared import invoke
 
 Columns = dict[str, np.ndarray]
@@ -34,9 +34,9 @@ STEERED = replace(NAMED["bicycle_zero"], runs=2)
 
 
 @cache
-def tables(robot: MadeRobot) -> list[Columns]:
+def tables(robot: MadeRobot, floor: Floor) -> list[Columns]:
     rng = np.random.default_rng(0)
-    runs = [driven(robot, robot.floors[0], commands(robot, rng, k, False), rng) for k in range(2)]
+    runs = [driven(robot, floor, commands(robot, rng, k, False), rng) for k in range(2)]
     return [{k: v[:ROWS] for k, v in table(robot, run, rng).items()} for run in runs]
 
 
@@ -48,8 +48,9 @@ def write(
     order: tuple[int, ...] = (),
 ) -> Path:
     """Write logs of a robot, spoilt, and its config with a wrong radius or order of columns."""
-    for k, columns in enumerate(tables(replace(robot, runs=2))[: robot.runs]):
-        write_csv(folder / "logs" / robot.floors[0].name / f"{k}.csv", spoil(columns, k))
+    for floor in robot.floors:
+        for k, columns in enumerate(tables(replace(robot, runs=2), floor)[: robot.runs]):
+            write_csv(folder / "logs" / floor.name / f"{k}.csv", spoil(columns, k))
     text = config(replace(robot, nominal_radius=radius * robot.nominal_radius))
     (listed,) = re.findall(r"columns = \[(.*?)\]", text)
     names = listed.split(", ")
@@ -211,3 +212,14 @@ def test_identify_refuses_wheels_that_never_turn(tmp_path):
     result = invoke("identify", file, *words)
     assert result.exit_code == 2
     assert "no wheel turns in these runs" in result.stderr
+
+
+@pytest.mark.slow
+def test_wheels_that_slip_far_on_one_of_two_floors_are_identified_there():
+    hard, soft = (replace(MIXED.floors[0], name=name) for name in ("hard", "soft"))
+    soft = replace(soft, radius=tuple(0.25 * r for r in soft.radius))
+    calibration, said = judged(replace(MIXED, floors=(hard, soft)))
+    assert calibration.firmest == "hard"
+    assert {v.verdict for row in calibration.radius.values() for v in row} == {"identified"}
+    assert calibration.radius["soft"][0].value == pytest.approx(0.25 * 0.05, rel=0.02)
+    assert "is not to be trusted" not in said

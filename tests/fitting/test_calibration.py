@@ -8,13 +8,15 @@ import pytest
 
 from slipid.app.config import read_config
 from slipid.app.problem import read_fit_task
+from slipid.data.log import WheelReading
 from slipid.data.runs import collect
 from slipid.fitting.calibration import Calibration, Value, calibrate
+from slipid.fitting.innovations import pose_tracks
 from slipid.search_space import Choice, Space
 from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import commands, driven, table, write, write_csv
 from tests.benchmarks.every_robot.fits import covered
-from tests.benchmarks.every_robot.robots import ROBOTS, MadeRobot
+from tests.benchmarks.every_robot.robots import ROBOTS, Floor, MadeRobot
 
 MADE = {robot.name: robot for robot in ROBOTS}
 
@@ -87,6 +89,22 @@ def test_what_only_turning_tells_is_not_identified_without_turns(task_of):
     assert [place.value for place in found.offset] == [0.0, 0.0]
 
 
+def test_gentle_curves_show_the_track_of_wheels_that_skid(tmp_path):
+    """Ten degrees a run: with the config's track, radii would be a fifth too small."""
+    robot = replace(MADE["diff_own"], name="gentle", floors=(Floor("grass", (0.08, 0.08), 0.75),))
+    rng = np.random.default_rng(5)
+    write(replace(robot, runs=1), tmp_path, seed=3)
+    for number in range(10):
+        legs = np.array([[8.0, 0.3, 0.0, 0.04 * rng.uniform(-1, 1)]])
+        run = driven(robot, robot.floors[0], legs, rng)
+        write_csv(tmp_path / "logs" / "grass" / f"{number:02d}.csv", table(robot, run, rng))
+    with Reporter(quiet=True) as report:
+        task = read_fit_task(read_config(tmp_path / "robot.toml"), tmp_path / "logs", report)
+    found = calibrated(task)
+    assert all(near(r, 0.08, 5e-4) for r in found.radius["grass"])
+    assert near(found.base["grass"], 0.75, 0.05)
+
+
 def test_positions_without_headings(task_of):
     """Radii, track and the place of an antenna follow from positions alone."""
     data = task_of(MADE["diff_own"]).dataset
@@ -127,6 +145,30 @@ def test_a_number_that_the_config_fixes_stays(task_of):
     assert found.lag.value == 0.02
     assert found.lag.verdict == "fixed"
     assert found.lag.interval90 == (0.02, 0.02)
+
+
+def test_a_prior_of_the_config_for_the_place_of_the_pose_sensor_counts(task_of):
+    """The tracker is .06 m ahead; the user is sure that it is at .05 m."""
+    sure = Choice("camera.marker_place", prior_mean=[0.05, 0.0], prior_std=1e-5, free=True)
+    found = calibrated(task_of(MADE["diff_own"]), sure)
+    assert found.offset[0].value == pytest.approx(0.05, abs=1e-4)
+
+
+def test_poses_are_far_apart_where_wheel_speeds_are_read_rarely(task_of):
+    """Speeds that are read every .15 s: poses every .6 s instead of every .2 s."""
+    data, rng = task_of(MADE["diff_own"]).dataset, np.random.default_rng(0)
+
+    def poses(channel: str) -> int:
+        logs = []
+        for log in data.logs:
+            rows = int(np.ceil(0.15 / np.median(np.diff(log.time))))
+            speed = np.repeat(rng.normal(size=(log.samples // rows + 1, 2)), rows, axis=0)
+            reading = WheelReading(channel)
+            logs.append(replace(log, wheel_speed=speed[: log.samples], wheel_reading=reading))
+        tracks = pose_tracks(collect(logs), 0.0, np.full((3, 2), 0.02), 0.2)
+        return int(np.isfinite(tracks.pose[..., 0]).sum())
+
+    assert poses("wheel_angle") > 2.5 * poses("wheel_speed")
 
 
 def test_intervals_from_one_run_are_wider_than_from_all(task_of):
