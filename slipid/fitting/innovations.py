@@ -357,7 +357,7 @@ def _slope(at: Array, step: Array, far: Array, process: Array) -> tuple[Array, A
     return slope, jnp.pad(jnp.array(square), (0, 3))
 
 
-Tracks = tuple[np.ndarray, ...]
+Tracks = tuple[Array | np.ndarray, ...]
 """Poses, turns, their slopes, distances and start headings of all tracks."""
 
 
