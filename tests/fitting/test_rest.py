@@ -47,9 +47,10 @@ def test_dry_friction_is_not_viscous_where_rest_and_motion_mix(voltage):
     assert fit.converged
     for path, truth in resting.TRUTH.items():
         if path not in known:
-            low, high = fit.parameters[path].interval90
-            assert low < truth < high, (path, low, high)
-            assert fit.parameters[path].verdict == "identified"
+            found = fit.parameters[path]
+            assert found.value == pytest.approx(truth, rel=0.02), path
+            assert abs(found.value - truth) < 2.5 * found.std, path
+            assert found.verdict == "identified"
 
 
 @pytest.mark.slow
