@@ -16,7 +16,7 @@ from slipid.data.align.clock import Clock
 from slipid.data.check.findings import NOT_CALIBRATED, Finding, worst_first
 from slipid.data.check.sanity import findings
 from slipid.data.runs import Runs, channels
-from slipid.fitting.calibration import evenly
+from slipid.fitting.calibrate import evenly
 from slipid.fitting.problem import CREEPS, Problem
 from slipid.fitting.variances import Search
 from slipid.infer import slip_curves as curves_of

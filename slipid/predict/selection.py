@@ -9,7 +9,7 @@ show by their errors what other paths would.
 
 Runs are held out in folds: in sectors of the commanded direction if every floor was driven in at
 least `LEAST_SECTORS` of them, else in groups of runs. The models without a fold follow from the
-models of all runs by one Gauss-Newton step (`fitting.newton`, `fitting.calibration`). A floor with
+models of all runs by one Gauss-Newton step (`fitting.newton`, `fitting.calibrate`). A floor with
 a single run has no held-out run; its run is predicted by the models that were fitted to it.
 
 The error of a run is the mean, over the whole run and its three halves from its beginning, quarter
@@ -29,7 +29,8 @@ from jaxtyping import Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
-from slipid.fitting.calibration import Calibration, cross_calibrated
+from slipid.fitting.calibrate import cross_calibrated
+from slipid.fitting.calibration import Calibration
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
@@ -161,7 +162,7 @@ class KinematicFit:
 def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> KinematicFit:
     """Return the calibration of runs, and errors of `nominal` and `calibrated` on held-out runs.
 
-    Arguments are those of `slipid.fitting.calibration.calibrate`.
+    Arguments are those of `slipid.fitting.calibrate.calibrate`.
     """
     fold, robot = selection_folds(data), space.template
     whole, without = cross_calibrated(data, space, choices, fold)
