@@ -433,7 +433,7 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
 
     def is_far(names: Sequence[str]) -> bool:
         """Return whether a length is far from the config's; the names are those of its parts."""
-        return abs(total(names)) > np.log(ABSURD)
+        return bool(abs(total(names)) > np.log(ABSURD))
 
     def value(
         names: Sequence[str], unit: str, log_of: float | None = None, far: bool = False

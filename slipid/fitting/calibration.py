@@ -172,11 +172,18 @@ class Calibration:
         return np.array([*radius, base, centre, *steering])
 
     def seen(self, robot: Robot) -> Robot:
-        """Return a robot whose poses are measured by the calibrated pose sensor."""
+        """Return a robot whose poses are measured by the calibrated pose sensor.
+
+        The sensor has a scale, but no tilt and no distortion: both were not calibrated.
+        """
+        none = as_numbers(np.zeros(2))
         deviations = [self.session_yaw.get(s, 0.0) for s in robot.camera.sessions]
         camera = replace(
             robot.camera,
             scale=as_numbers(self.scale.value),
+            tilt=none,
+            radial=as_numbers(0.0),
+            tangential=none,
             lag=as_numbers(self.lag.value),
             marker_yaw=as_numbers(self.yaw.value),
             session_yaw=as_numbers(np.array(deviations)),

@@ -87,7 +87,7 @@ def rolled(
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Calibrated kinematics of the drives of a robot on each of its floors.
+    """Calibrated kinematics of the drives of a robot on each of its floors; arrays may be batched.
 
     Attributes:
         labels: names of the floors.
@@ -104,27 +104,21 @@ class Kinematics:
     labels: tuple[str, ...]
     rolling: Float[np.ndarray, "3 drive"]
     nominal_base: float
-    radius: Float[np.ndarray, "floor drive"]
-    base: Float[np.ndarray, " floor"]
-    centre: Float[np.ndarray, " floor"]
+    radius: Float[np.ndarray, "*batch floor drive"]
+    base: Float[np.ndarray, "*batch floor"]
+    centre: Float[np.ndarray, "*batch floor"]
     steering: Steering | None = None
 
-    def matrices(self) -> Float[np.ndarray, "floor 3 drive"]:
+    def matrices(self) -> Float[np.ndarray, "*batch floor 3 drive"]:
         """Return the matrices from wheel speeds [rad/s] to body twists [m/s, m/s, rad/s]."""
         return matrices(self.rolling, self.radius, self.base / self.nominal_base, self.centre)
-
-    def matrix(self, floor: str) -> Float[np.ndarray, "3 drive"]:
-        """Return the matrix of one floor; raise `ValueError` if the floor was not calibrated."""
-        if floor not in self.labels:
-            raise ValueError(f"no surface '{floor}'; calibrated: {', '.join(self.labels)}")
-        return self.matrices()[self.labels.index(floor)]
 
 
 def matrices(
     rolling: Float[np.ndarray, "3 drive"],
     radius: Float[np.ndarray, "*batch drive"],
-    base_ratio: Float[np.ndarray, "*batch"],
-    centre: Float[np.ndarray, "*batch"],
+    base_ratio: Float[np.ndarray, "*batch"] | float,
+    centre: Float[np.ndarray, "*batch"] | float,
 ) -> Float[np.ndarray, "*batch 3 drive"]:
     """Return the matrices from wheel speeds [rad/s] to body twists; see the module docstring.
 
@@ -132,7 +126,7 @@ def matrices(
     """
     out = rolling * radius[..., None, :]
     out[..., 2, :] /= np.asarray(base_ratio)[..., None]
-    out[..., 1, :] -= centre[..., None] * out[..., 2, :]
+    out[..., 1, :] -= np.asarray(centre)[..., None] * out[..., 2, :]
     return np.asarray(out)
 
 

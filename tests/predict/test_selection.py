@@ -1,19 +1,40 @@
 """Selection of a slip model by held-out runs: the rule itself, on made errors."""
 
 import itertools
-from types import SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from slipid.data.log import Log
+from slipid.data.runs import collect
 from slipid.predict.open_loop import Tracks
 from slipid.predict.selection import path_errors, selected, selection_folds
 
 
 def runs(floors, heading_deg=None):
-    logs = [SimpleNamespace(surface=f, load="as_built", name=str(k)) for k, f in enumerate(floors)]
-    heading = np.full(len(floors), np.nan) if heading_deg is None else np.radians(heading_deg)
-    return SimpleNamespace(logs=logs, heading=heading, speed=np.full(len(floors), np.nan))
+    """Runs on floors, with a steady command in a direction if there is one."""
+    logs = []
+    for k, floor in enumerate(floors):
+        way = None if heading_deg is None else np.radians(heading_deg[k])
+        command = (
+            None if way is None else np.tile([0.1 * np.cos(way), 0.1 * np.sin(way), 0.0], (9, 1))
+        )
+        logs.append(
+            Log(
+                name=str(k),
+                path=Path(str(k)),
+                sha256=str(k),
+                time=np.arange(9.0),
+                wheel_angle=np.tile(np.arange(9.0)[:, None], 2),
+                twist_command=command,
+                current_is_signed=False,
+                pose=np.zeros((9, 3)),
+                surface=floor,
+                load="as_built",
+            )
+        )
+    return collect(logs)
 
 
 def errors(**means):
