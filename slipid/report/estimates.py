@@ -196,7 +196,7 @@ def show_check(page: Page, found: Content) -> None:
         page.line(f"repaired in {count} runs: {note}")
     if "calibration" in found:
         show_calibration(page, Calibration.of_json(found["calibration"]))
-    page.notes(found["suspects"])
+    page.notes(found.get("suspects", ()))
     page.line(
         "before a fit: what a fit may find, from the least to the most informative of plausible "
         "floors, motors and noise; only the fit itself can find at bound or disputed"

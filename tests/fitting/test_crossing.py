@@ -530,7 +530,7 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     config, out = written(tmp_path, text), tmp_path / "out"
     said = invoke("identify", config, "--data", tmp_path / "logs", "--out", out)
     assert said.exit_code == 0, said.stderr
-    assert "were not used, since they contradict those on one floor" in said.stderr
+    assert "were not used, since they contradict the runs on one floor" in said.stderr
     fit = load(out)
     assert fit.mixed is None
     assert fit.refused["reason"] in fit.messages
