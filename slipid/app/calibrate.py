@@ -11,7 +11,7 @@ from slipid.app.bench_priors import COPY_NAME
 from slipid.app.logs import write_run_file
 from slipid.app.problem import NO_BALANCE, ConfigFitTask, FitTask
 from slipid.data.wheel_signals import interpolate
-from slipid.fitting.calibration import ABSURD, Calibration
+from slipid.fitting.calibration.result import ABSURD, Calibration
 from slipid.infer.fit_file import IDENTIFIED, SCHEMA
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
 from slipid.predict.selection import FloorSelection, KinematicFit, kinematic_fit, selected
@@ -137,11 +137,11 @@ def _one_speed(task: FitTask) -> Iterator[str]:
     runs, shape = task.dataset, task.robot.geometry
     to_body = np.asarray(shape.pseudo_inverse()) * float(shape.wheel_radius)
     speeds: dict[str, list[np.ndarray]] = {}
-    for log in runs.logs:
+    for floor, log in zip(runs.surface, runs.logs, strict=True):
         edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / SPEED_STEP_S)))
         turned = np.diff(interpolate(log.time, log.wheel_angle, edges), axis=0)
         ahead = np.linalg.norm(turned @ to_body[:2].T, axis=1) / (edges[1] - edges[0])
-        speeds.setdefault(log.surface or "unknown", []).append(ahead)
+        speeds.setdefault(floor, []).append(ahead)
     usual = {}
     for floor, parts in speeds.items():
         each = np.concatenate(parts)
@@ -154,8 +154,8 @@ def _one_speed(task: FitTask) -> Iterator[str]:
     places = ", ".join(f"{floor} ({speed:.2g} m/s)" for floor, speed in usual.items())
     headings = np.isfinite(runs.pose[:, 2]).any()
     yield (
-        f"one speed alone on {places}: whether slip grows with speed (its viscous terms) cannot be "
-        "told, so other speeds are extrapolated"
+        f"one speed alone on {places}: the runs do not show whether slip grows with speed (its "
+        "viscous terms), so that other speeds are extrapolated"
         + (
             ""
             if headings

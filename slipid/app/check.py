@@ -16,7 +16,7 @@ from slipid.data.align.clock import Clock
 from slipid.data.check.findings import NOT_CALIBRATED, Finding, worst_first
 from slipid.data.check.sanity import findings
 from slipid.data.runs import Runs, channels
-from slipid.fitting.calibrate import evenly
+from slipid.fitting.calibration.estimate import evenly
 from slipid.fitting.problem import CREEPS, Problem
 from slipid.fitting.variances import Search
 from slipid.infer import slip_curves as curves_of
@@ -215,7 +215,7 @@ def calibration_part(
         return task, {"suspects": [sentence]}
     data = task.dataset
     if len(data) > MOST_CALIBRATED:
-        some = evenly([log.surface or "unknown" for log in data.logs], MOST_CALIBRATED)
+        some = evenly(data.surface, MOST_CALIBRATED)
         data = data.subset(some)
         report.line(f"calibrated from {len(data)} of {len(task.dataset)} runs")
     try:
@@ -236,7 +236,7 @@ def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
     data = task.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
-        groups.setdefault((log.surface or "unknown", log.load, data.session[k]), []).append(k)
+        groups.setdefault((data.surface[k], log.load, data.session[k]), []).append(k)
     # Equal notes on several runs become one note with a count.
     notes = Counter(note for log in data.logs for note in log.notes)
     return {

@@ -16,7 +16,7 @@ from slipid.app.logs import read_dataset
 from slipid.app.problem import ConfigFitTask, read_fit_task, shape_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.fitting.calibration import Calibration
+from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import IDENTIFIED, load

@@ -32,7 +32,7 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, require_whole_poses, steady_duration, windows
-from slipid.fitting.calibration import Calibration
+from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.problem import Problem, fixed_viscosities
 from slipid.infer.bench.motor import BenchRoot
 from slipid.model.geometry import Geometry
@@ -479,9 +479,8 @@ def robot_for_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Rob
 
     `centre` is the centre of the image, in the frame of the poses [m].
     """
-    floors = {log.surface or "unknown" for log in runs.logs}
     loads = {log.load for log in runs.logs}
-    return robot.on(sorted(floors), sorted(loads), sorted(set(runs.session)), centre)
+    return robot.on(sorted(set(runs.surface)), sorted(loads), sorted(set(runs.session)), centre)
 
 
 def shape_of(config: Config) -> Geometry:

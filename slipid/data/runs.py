@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,11 @@ class Runs:
         if self.aside:
             lines += [f"{counted(len(self.aside), 'run')} set aside:", *_first(self.aside, "runs")]
         return "\n".join(lines)
+
+    @cached_property
+    def surface(self) -> tuple[str, ...]:
+        """Name of the floor of each run; `unknown` if its log names none."""
+        return tuple(log.surface or "unknown" for log in self.logs)
 
     def rows(self, run: int) -> slice:
         """Return the slice of the flat arrays that holds one run."""

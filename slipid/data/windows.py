@@ -117,7 +117,7 @@ def windows(
     logs = [data.logs[k] for k in run]
     return Windows(
         run=np.asarray(run),
-        surface=tuple(log.surface or "unknown" for log in logs),
+        surface=tuple(data.surface[k] for k in run),
         load=tuple(log.load for log in logs),
         session=tuple(data.session[k] for k in run),
         **together,
@@ -231,13 +231,19 @@ def _edges(
     return [rows[k : k + per_segment + 1] for k in range(0, count, per_segment)]
 
 
+def has_whole_poses(data: Runs, run: int) -> bool:
+    """Return whether the poses of a run have all coordinates, and are more than two."""
+    pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
+    return len(pose) > 2 and bool(np.isfinite(pose).all())
+
+
 def require_whole_poses(data: Runs, run: int) -> None:
     """Raise `NoForceBalance` if poses of a run lack a coordinate, or if there are at most two."""
+    if has_whole_poses(data, run):
+        return
     pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
     lacking = np.isnan(pose).any(axis=0)
     what = "without headings" if lacking[2] else "without positions" if lacking.any() else ""
-    if not what and len(pose) > 2:
-        return
     raise NoForceBalance(
         f"{data.logs[run].name}: poses {what or f'in {len(pose)} rows only'}; expected x, y and "
         "heading during the run, which a fit of motors and contact needs. Kinematics alone can be "

@@ -14,7 +14,7 @@ import numpy as np
 
 from slipid.data.runs import Runs
 from slipid.deploy.robot_record import effects_by_load, robot_record
-from slipid.fitting.calibration import Calibration
+from slipid.fitting.calibration.result import Calibration
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.result import Fit, draws
 from slipid.infer.verdicts.estimates import Estimate

@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.fitting.calibration import Calibration
+from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.shared_effects import FittedEffects, SpeedAndLoad
 from slipid.infer.result import Channels, Fit
 from slipid.infer.slip_curves import SlipCurve

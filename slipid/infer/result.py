@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
-from slipid.fitting.calibration import Calibration
+from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.noise import POOLED
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem

@@ -137,7 +137,7 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     floor, length = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
     out: dict[str, Validity] = {}
     for k, label in enumerate(robot.surfaces.labels):
-        runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
+        runs = [i for i, surface in enumerate(data.surface) if surface == label]
         mine = floor == k
         most = [float(np.abs(x[mine]).max()) for x in (speed, torque, slip, yaw)]
         if 2 * sum(has_steady_command(data.logs[i]) for i in runs) > len(runs):

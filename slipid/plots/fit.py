@@ -178,7 +178,7 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
 
 def validate_plots(fit: Fit, data: Runs, found: Validation, out: Path) -> list[Path]:
     """Write figures of a validation's errors and of some predicted paths; return the files."""
-    names = {log.surface or "unknown": None for log in data.logs}
+    names = dict.fromkeys(data.surface)
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {
         "validation_errors": found.plot(),

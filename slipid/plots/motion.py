@@ -108,7 +108,7 @@ def runs_by_setup(data: Runs) -> dict[tuple[str, str], list[int]]:
     """Return the indices of the runs of each (floor, load set-up)."""
     groups: dict[tuple[str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
-        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
+        groups.setdefault((data.surface[k], log.load), []).append(k)
     return groups
 
 

@@ -83,7 +83,7 @@ def floor_errors(
     Both models were fitted to these runs, the second one also to runs over several floors.
     """
     (old, distance), (new, _) = end_errors(before, data), end_errors(after, data)
-    return compared([log.surface or "unknown" for log in data.logs], old, new, distance)
+    return compared(data.surface, old, new, distance)
 
 
 def compared(

@@ -44,7 +44,7 @@ class FoldKey:
 
 def fold_keys(data: Runs) -> list[FoldKey]:
     """Return the fold keys of all runs; unknown directions and speeds are nan."""
-    where = setups([log.surface or "unknown" for log in data.logs], [log.load for log in data.logs])
+    where = setups(data.surface, [log.load for log in data.logs])
     heading, speed = np.degrees(data.heading).tolist(), data.speed.tolist()
     return [FoldKey(*key) for key in zip(where, heading, speed, strict=True)]
 

@@ -154,8 +154,8 @@ of the centre of rotation [m]."""
 class Calibrated(TwistModel):
     """Calibrated kinematics: effective radius of every drive, track or base, centre of rotation.
 
-    The coefficients are those of `slipid.fitting.calibration.Calibration.numbers`: log radius
-    ratios of the drives, log base ratio, centre [m], and numbers of the steering, if any. `learn`
+    The coefficients are those of the method `numbers` of a `Calibration`: log radius ratios of the
+    drives, log base ratio, centre [m], and numbers of the steering, if any. `learn`
     estimates them for one floor from windows of body poses, so that pose sensor and lag are taken
     as known; it estimates no steering.
 

@@ -9,7 +9,7 @@ show by their errors what other paths would.
 
 Runs are held out in folds: in sectors of the commanded direction if every floor was driven in at
 least `LEAST_SECTORS` of them, else in groups of runs. The models without a fold follow from the
-models of all runs by one Gauss-Newton step (`fitting.newton`, `fitting.calibrate`). A floor with
+models of all runs by one Gauss-Newton step (`fitting.newton`, `fitting.calibration`). A floor with
 a single run has no held-out run; its run is predicted by the models that were fitted to it.
 
 The error of a run is the mean, over the whole run and its three halves from its beginning, quarter
@@ -29,8 +29,9 @@ from jaxtyping import Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
-from slipid.fitting.calibrate import cross_calibrated
-from slipid.fitting.calibration import Calibration
+from slipid.data.windows import has_whole_poses
+from slipid.fitting.calibration.estimate import cross_calibrated, evenly
+from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
@@ -109,7 +110,7 @@ class FloorSelection:
 
 def selection_folds(data: Runs) -> Int[np.ndarray, " run"]:
     """Return the fold in which each run is held out, -1 for the only run of a floor."""
-    floor = np.array([log.surface or "unknown" for log in data.logs])
+    floor = np.array(data.surface)
     fold = sectors(fold_keys(data))
     many = all(len(set(fold[floor == f].tolist()) - {-1}) >= LEAST_SECTORS for f in set(floor))
     if not many or (fold < 0).any():
@@ -162,7 +163,7 @@ class KinematicFit:
 def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> KinematicFit:
     """Return the calibration of runs, and errors of `nominal` and `calibrated` on held-out runs.
 
-    Arguments are those of `slipid.fitting.calibrate.calibrate`.
+    Arguments are those of `slipid.fitting.calibration.estimate.calibrate`.
     """
     fold, robot = selection_folds(data), space.template
     whole, without = cross_calibrated(data, space, choices, fold)
@@ -173,11 +174,11 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
     for k, runs in _picked(data, fold).items():
         calibration = without.get(k, whole)
         seen, own = calibration.seen(robot), calibrated_model(calibration, robot.geometry)
-        whole_poses = np.array([_has_whole_poses(data, run) for run in runs.tolist()])
+        whole_poses = np.array([has_whole_poses(data, run) for run in runs.tolist()])
         for run in runs[~whole_poses].tolist():
-            floor = data.logs[run].surface or "unknown"
+            fitted = own.fitted[data.surface[run]]
             errors["nominal"][run] = aligned_error(data, run, plain.model, seen)
-            errors["calibrated"][run] = aligned_error(data, run, own.fitted[floor], seen)
+            errors["calibrated"][run] = aligned_error(data, run, fitted, seen)
         runs = runs[whole_poses]
         for w in replay.replay_windows(data.subset(runs), seen) if len(runs) else ():
             cases = {"nominal": (plain, w), "calibrated": (own, w)}
@@ -188,12 +189,6 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
                 errors[name][runs[tracks.run]] = path_errors(tracks)
     kept = {name: errors[name] for name in MODELS[:2]}
     return KinematicFit(whole, kept, tuple(_mislabelled(data, errors, floors)))
-
-
-def _has_whole_poses(data: Runs, run: int) -> bool:
-    """Return whether a run has enough poses with all coordinates to be predicted in steps."""
-    pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
-    return len(pose) > 2 and bool(np.isfinite(pose).all())
 
 
 PARTS_OF_GAP, LONGEST_PART_S = 4, 0.2
@@ -248,7 +243,7 @@ def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float
 
 def _mislabelled(data: Runs, errors: Errors, floors: Sequence[str]) -> Iterator[str]:
     """Yield a sentence for every run that the kinematics of another floor predict far better."""
-    label = np.array([log.surface or "unknown" for log in data.logs])
+    label = np.array(data.surface)
     usual = {f: float(np.nanmedian(errors["calibrated"][label == f])) for f in floors}
     for k, log in enumerate(data.logs):
         own = errors["calibrated"][k]
@@ -299,7 +294,7 @@ def selected(
         errors: errors of all models, simplest model first.
         contradicted: floors on which the calibration contradicts the lengths of the config.
     """
-    floor = np.array([log.surface or "unknown" for log in data.logs])
+    floor = np.array(data.surface)
     fold, cluster = selection_folds(data), clusters(np.degrees(data.heading).tolist())
     out = {}
     for name in sorted(set(floor.tolist())):
@@ -347,11 +342,5 @@ def _between(
 
 def _picked(data: Runs, fold: Int[np.ndarray, " run"]) -> dict[int, Int[np.ndarray, " some"]]:
     """Return the indices of at most `MOST_RUNS` runs of every floor, keyed by their fold."""
-    floor = np.array([log.surface or "unknown" for log in data.logs])
-    some = []
-    for name in sorted(set(floor.tolist())):
-        mine = np.flatnonzero(floor == name)
-        at = np.linspace(0, len(mine) - 1, min(MOST_RUNS, len(mine)))
-        some.append(mine[at.round().astype(int)])
-    runs = np.concatenate(some)
+    runs = evenly(data.surface, MOST_RUNS * len(set(data.surface)))
     return {k: runs[fold[runs] == k] for k in sorted(set(fold[runs].tolist()))}

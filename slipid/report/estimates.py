@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
-from slipid.fitting.calibration import Calibration
+from slipid.fitting.calibration.result import Calibration
 from slipid.report.page import Page, percent, table, verdict
 from slipid.support.content import Content
 
 if TYPE_CHECKING:
-    from slipid.fitting.calibration import Value
+    from slipid.fitting.calibration.result import Value
     from slipid.infer.bench.verdict import BenchFit
     from slipid.infer.posterior.diagnosis import Posterior
     from slipid.infer.result import Fit

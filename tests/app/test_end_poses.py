@@ -7,7 +7,7 @@ import pytest
 
 from slipid.app.config import read_config
 from slipid.app.problem import read_fit_task
-from slipid.fitting.calibrate import calibrate
+from slipid.fitting.calibration.estimate import calibrate
 from slipid.search_space import Space
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter

@@ -9,7 +9,7 @@ import pytest
 
 from slipid.app.config import parsed, read_config
 from slipid.app.problem import read_fit_task
-from slipid.fitting.calibration import Calibration
+from slipid.fitting.calibration.result import Calibration
 from slipid.parameter import as_numbers
 from slipid.predict.kinematics import Calibrated, nominal
 from slipid.predict.open_loop import replay_windows, tracks_from_increments

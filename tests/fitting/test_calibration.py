@@ -10,9 +10,9 @@ from slipid.app.config import read_config
 from slipid.app.problem import read_fit_task
 from slipid.data.log import WheelReading
 from slipid.data.runs import collect
-from slipid.fitting.calibrate import calibrate
-from slipid.fitting.calibration import Calibration, Value
-from slipid.fitting.innovations import pose_tracks
+from slipid.fitting.calibration.estimate import calibrate
+from slipid.fitting.calibration.innovations import pose_tracks
+from slipid.fitting.calibration.result import Calibration, Value
 from slipid.search_space import Choice, Space
 from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import commands, driven, table, write, write_csv

@@ -7,7 +7,7 @@ import pytest
 
 from slipid.data.log import Log
 from slipid.data.runs import collect
-from slipid.fitting.gyro import gyro_errors
+from slipid.fitting.calibration.gyro import gyro_errors
 
 SCALE, BIAS, LAG = 1.03, 0.02, 0.15
 """True yaw rate = SCALE (reading - BIAS); headings are late by LAG [s]."""

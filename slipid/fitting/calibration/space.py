@@ -1,6 +1,6 @@
 """Numbers of a calibration as one vector with a Gaussian prior, and what they mean for the robot.
 
-`slipid.fitting.calibrate` has the equations.
+Module `estimate` has the equations.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.runs import Runs
+from slipid.model.geometry import Geometry
 from slipid.model.kinematics import Kinematics, Steering, is_axle, nominal_base
 from slipid.search_space import Choice, Space
 
@@ -42,6 +43,11 @@ SMALL_TURN, EXPLAINED, LEAST_TURNS = 0.1, 0.8, 6
 show a track if they exceed this one on average [rad] and explain this fraction of the squares of
 the measured changes [1], in at least this number of runs. They never show the base of wheels that
 determine the twist, whose slip depends on the direction of travel, and so does the turning."""
+
+
+def has_centre(shape: Geometry) -> bool:
+    """Return whether floors may differ in the point about which the robot turns."""
+    return not shape.determines_twist and not is_axle(shape)
 
 
 def base_names(floor: str) -> tuple[str, ...]:
@@ -87,7 +93,7 @@ class CalibrationSpace:
         cls, space: Space, choices: Sequence[Choice], data: Runs, firmest: int
     ) -> "CalibrationSpace":
         shape = space.template.geometry
-        floors = tuple(sorted({log.surface or "unknown" for log in data.logs}))
+        floors = tuple(sorted(set(data.surface)))
         sessions = tuple(sorted(set(data.session)))
         scale = _given(space, choices, "camera.scale", 0.0)
         loose = scale.std > LOOSE_SCALE_STD * scale.mean
@@ -108,7 +114,7 @@ class CalibrationSpace:
             numbers["zero"] = Coordinate(0.0, ZERO_STD)
             numbers["gain"] = Coordinate(1.0, GAIN_STD)
             numbers["understeer"] = Coordinate(0.0, UNDERSTEER_STD)
-        if not shape.determines_twist and not is_axle(shape):
+        if has_centre(shape):
             numbers |= {f"centre.{f}": Coordinate(0.0, size) for f in others}
         for axis, name in enumerate("xy"):
             numbers[f"offset.{name}"] = _given(space, choices, "camera.marker_place", size, axis)
@@ -146,12 +152,6 @@ class CalibrationSpace:
             return np.asarray(z[..., self.free.index(name)])
         return np.full(z.shape[:-1], self.numbers[name].mean)
 
-    @cached_property
-    def has_centre(self) -> bool:
-        """True if floors differ in the point about which the robot turns."""
-        shape = self.space.template.geometry
-        return not shape.determines_twist and not is_axle(shape)
-
     def kinematics(self, z: Float[np.ndarray, "*batch free"]) -> Kinematics:
         """Return the kinematics at a search vector; for several, arrays have leading axes."""
         shape, floors = self.space.template.geometry, self.floors
@@ -188,12 +188,6 @@ class CalibrationSpace:
         front = np.full(base.shape, float(driven == "front"))
         return Steering(base, zero, gain, understeer, front)
 
-    def matrices(
-        self, z: Float[np.ndarray, "*batch free"]
-    ) -> Float[np.ndarray, "*batch floor 3 drive"]:
-        """Return the matrices from wheel turns to body increments on every floor."""
-        return self.kinematics(z).matrices()
-
     @cached_property
     def rolling(self) -> Float[np.ndarray, "3 drive"]:
         """Pseudo-inverse of the config's geometry."""
@@ -210,12 +204,12 @@ def floors_with_turns(space: Space, data: Runs) -> set[str]:
     shape = space.template.geometry
     yaw = np.asarray(shape.pseudo_inverse())[2] * float(shape.wheel_radius)
     turned: dict[str, list[tuple[float, float, float]]] = {}
-    for k, log in enumerate(data.logs):
+    for k, floor in enumerate(data.surface):
         rows = data.rows(k)
         seen = np.flatnonzero(data.fresh[rows] & np.isfinite(data.pose[rows, 2]))
         wheels, poses = data.wheel_angle[rows] @ yaw, np.unwrap(data.pose[rows, 2][seen])
         ends = (wheels[seen[-1]] - wheels[seen[0]], poses[-1] - poses[0]) if len(seen) else (0, 0)
-        turned.setdefault(log.surface or "unknown", []).append((float(np.ptp(wheels)), *ends))
+        turned.setdefault(floor, []).append((float(np.ptp(wheels)), *ends))
     gently = not shape.determines_twist
     return {floor for floor, each in turned.items() if _shows_turns(np.array(each), gently)}
 

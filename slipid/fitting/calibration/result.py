@@ -1,6 +1,6 @@
 """Calibrated kinematics and pose sensor of a robot: the numbers with their intervals.
 
-`slipid.fitting.calibrate` estimates them from runs with poses.
+Module `estimate` estimates them from runs with poses.
 """
 
 from collections.abc import Mapping

@@ -13,7 +13,7 @@ Every fit begins with these numbers (see `slipid.model.kinematics` for the equat
     pose sensor                      place p, yaw psi (with a deviation for every session), lag, and
                                      scale of the positions
 
-They minimise the squared whitened innovations of all poses (`slipid.fitting.innovations`), each run
+They minimise the squared whitened innovations of all poses (module `innovations`), each run
 weighted by a Student t, plus a Gaussian prior. The variances of poses and motion are estimated by
 maximum likelihood in turn. Intervals are from a jackknife over runs, since the kinematics are wrong
 somewhere and errors of a run are alike; they are at least as wide as those of the likelihood.
@@ -39,7 +39,18 @@ from scipy.stats import t as student
 
 from slipid.data.align.lag import pose_lag
 from slipid.data.runs import Runs
-from slipid.fitting.calibration import (
+from slipid.fitting.calibration.gyro import LEAST_PARTS, gyro_errors
+from slipid.fitting.calibration.innovations import (
+    Motion,
+    PoseTracks,
+    innovations,
+    linear_innovations,
+    loss_of_noise,
+    pose_tracks,
+    sensor_yaw,
+    start_headings,
+)
+from slipid.fitting.calibration.result import (
     ABSURD,
     GYRO_PRIORS,
     IDENTIFIED,
@@ -49,17 +60,11 @@ from slipid.fitting.calibration import (
     Value,
     Verdict,
 )
-from slipid.fitting.calibration_space import CalibrationSpace, base_names, radius_names
-from slipid.fitting.gyro import LEAST_PARTS, gyro_errors
-from slipid.fitting.innovations import (
-    Motion,
-    PoseTracks,
-    innovations,
-    linear_innovations,
-    loss_of_noise,
-    pose_tracks,
-    sensor_yaw,
-    start_headings,
+from slipid.fitting.calibration.space import (
+    CalibrationSpace,
+    base_names,
+    has_centre,
+    radius_names,
 )
 from slipid.model.kinematics import Steering, nominal_base, nominal_steering
 from slipid.search_space import Choice, Space
@@ -110,7 +115,7 @@ class _Fit:
     @cached_property
     def floor(self) -> Int[np.ndarray, " track"]:
         """Index of the floor of each track; 0 for tracks that only fill the arrays."""
-        names = [self.data.logs[k].surface or "unknown" for k in self.tracks.run]
+        names = [self.data.surface[k] for k in self.tracks.run]
         return self._filled([self.model.floors.index(name) for name in names])
 
     @cached_property
@@ -201,10 +206,10 @@ class _Fit:
 
     def solved(self) -> "_Fit":
         """Return the fit with the search vector solved by Levenberg and Marquardt."""
-        now, damping = self, 1e-4
+        now, damping, (mean, std) = self, 1e-4, self.prior
         for _ in range(MOST_STEPS):
             g, a = now.gradient
-            loss = now.loss(now.z)
+            loss = float((now.linear[0] ** 2).sum() + (((now.z - mean) / std) ** 2).sum())
             for _ in range(8):
                 step = np.linalg.solve(a + damping * np.diag(np.diag(a)), -g)
                 if now.loss(now.z + step) <= loss * (1 + 1e-9):
@@ -310,13 +315,10 @@ def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
     if "lag" in model.free and lag is not None and lag.decisive:
         z[model.free.index("lag")] = lag.seconds
     typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:] + 2.0, len(model.floors))])
-    fit = _started(model, data, z, typical)
-    if len(data) <= MOST_START:
-        return _rounds(fit, choices)
     # Many runs only refine what a part of them has found.
-    some = evenly([log.surface or "unknown" for log in data.logs], MOST_START)
-    part = _rounds(_cut(replace(fit, runs=some)), choices)
-    return _rounds(_cut(replace(part, runs=None)), choices)
+    some = evenly(data.surface, MOST_START) if len(data) > MOST_START else None
+    fit = _rounds(_started(model, data, z, typical, some), choices)
+    return fit if some is None else _rounds(_cut(replace(fit, runs=None)), choices)
 
 
 def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
@@ -363,11 +365,17 @@ def _cut(fit: _Fit) -> _Fit:
     return replace(fit, tracks=tracks, weight=np.ones(len(tracks.pose)))
 
 
-def _started(model: CalibrationSpace, data: Runs, z: np.ndarray, log_variance: np.ndarray) -> _Fit:
+def _started(
+    model: CalibrationSpace,
+    data: Runs,
+    z: Float[np.ndarray, " free"],
+    log_variance: Float[np.ndarray, " variance"],
+    runs: Int[np.ndarray, " some"] | None,
+) -> _Fit:
     """Return the fit before its first round, with the sensor's yaw estimated from directions."""
     nothing = np.zeros(0)
     empty = PoseTracks(np.zeros(0, int), nothing, nothing, nothing, nothing, 0.0)
-    fit = _cut(_Fit(model, data, empty, z, log_variance, np.ones(0)))
+    fit = _cut(_Fit(model, data, empty, z, log_variance, np.ones(0), runs))
     tracks = fit.tracks
     if "yaw" not in model.free or not np.isfinite(tracks.pose).all(axis=-1).any():
         return fit
@@ -483,7 +491,7 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
             for f in model.floors
         },
         base={f: value(base_names(f), "m", base, far_base) for f in model.floors},
-        centre={f: value([f"centre.{f}"], "m") for f in model.floors if model.has_centre},
+        centre={f: value([f"centre.{f}"], "m") for f in model.floors if has_centre(shape)},
         offset=(value(["offset.x"], "m"), value(["offset.y"], "m")),
         yaw=value(["yaw"], "rad"),
         session_yaw={s: float(model.column(f"yaw@{s}", z)) for s in model.sessions},

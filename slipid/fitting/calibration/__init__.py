@@ -1,0 +1,1 @@
+"""Calibration of the kinematics and the pose sensor from poses, with which every fit begins."""
