@@ -9,7 +9,7 @@ import numpy as np
 
 from slipid.app.bench_priors import COPY_NAME
 from slipid.app.logs import write_run_file
-from slipid.app.problem import NO_BALANCE, ConfigFitTask, FitTask
+from slipid.app.problem import ConfigFitTask, FitTask
 from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration.result import ABSURD, Calibration
 from slipid.infer.fit_file import IDENTIFIED, SCHEMA
@@ -189,7 +189,7 @@ def calibrate_only(
     trust = verdict_of_trust(selection, notes=remarks(found, selection, task))
     writable(out)
     runs = [log.name for log in task.logs]
-    messages = [NO_BALANCE] if task.robot.geometry.driven is not None else []
+    messages = [] if task.calibration_only is None else [task.calibration_only]
     content = {
         "schema": SCHEMA,
         "parameters": {},

@@ -22,6 +22,7 @@ from slipid.infer.fit_file import save
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
+from slipid.infer.verdicts.trust import Trust
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.selection import (
     KinematicFit,
@@ -59,34 +60,36 @@ class IdentifyResult:
     profiles: tuple[Profile, ...]
     written: tuple[str, ...]
 
+    @property
+    def trust(self) -> Trust:
+        """Trust in the fit."""
+        return self.fit.trust
+
 
 def identify(
-    config_path: Path,
+    task: ConfigFitTask,
     data: Path,
     out: Path,
     report: Reporter,
     profiles: Sequence[str] = (),
-    anyway: bool = False,
 ) -> IdentifyResult:
     """Return the fit of a config's robot to its logs, and write all results to `out`.
 
     If `out` has the checkpoint of the same fit, which was interrupted, the fit resumes from it.
 
     Args:
-        config_path: the config.
+        task: runs and config, from `checked_task`.
         data: folder of the logs.
         out: folder to write to.
         report: reporter of the progress.
         profiles: paths of parameters whose profile likelihood is computed.
-        anyway: True to fit even if logs and config contradict each other; the contradictions are
-            reported.
 
     Raises:
-        NoForceBalance: the robot's wheels or the poses allow a calibration only.
-        DataError: config or logs are wrong; in this case nothing was written.
+        DataError: a path is wrong, or the runs allow only a calibration
+            (`FitTask.calibration_only`); in this case nothing was written.
     """
     began = time.monotonic()
-    task = with_mixed(checked_task(config_path, data, report, anyway), data, report)
+    task = with_mixed(task, data, report)
 
     def begin(problem: Problem) -> Checkpoint:
         for path in profiles:
@@ -122,8 +125,21 @@ def identify(
     return IdentifyResult(fit, task, tuple(result), written)
 
 
-def checked_task(config_path: Path, data: Path, report: Reporter, anyway: bool) -> ConfigFitTask:
-    """Return the fit task of a config whose runs do not contradict it; arguments of `identify`."""
+def checked_task(
+    config_path: Path, data: Path, report: Reporter, anyway: bool = False
+) -> ConfigFitTask:
+    """Return the fit task of a config whose runs do not contradict it.
+
+    Args:
+        config_path: the config.
+        data: folder of the logs.
+        report: reporter of the progress.
+        anyway: True to return a task even if logs and config contradict each other; the
+            contradictions are reported.
+
+    Raises:
+        DataError: config or logs are wrong.
+    """
     setup_jax(quiet=True)
     task = read_fit_task(read_config(config_path), data, report)
     report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")

@@ -187,7 +187,10 @@ def _files(root: Path, glob: str, where: str) -> list[Path]:
     """Return the files that match a glob; `where` names the place of the glob in errors."""
     try:
         return find_logs(root, glob)
-    except (ValueError, NotImplementedError) as error:
+    except (
+        ValueError,
+        NotImplementedError,
+    ) as error:  # pathlib raises the latter for absolute globs
         raise DataError(f"{where} '{glob}': {error}") from error
 
 

@@ -31,7 +31,7 @@ from slipid.data.check.columns import refuse_misordered
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
-from slipid.data.windows import Windows, require_whole_poses, steady_duration, windows
+from slipid.data.windows import Windows, incomplete_poses, steady_duration, windows
 from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.problem import Problem, fixed_viscosities
 from slipid.infer.bench.motor import BenchRoot
@@ -40,7 +40,7 @@ from slipid.model.kinematics import is_axle
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
-from slipid.support.errors import DataError, NoForceBalance, did_you_mean
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
 
@@ -129,11 +129,13 @@ class FitTask:
     mixed: tuple[tuple[Runs, FloorMap], ...] = ()
     user_choices: int = 0
 
-    def require_force_balance(self) -> None:
-        """Raise `NoForceBalance` if none can be fitted to the robot's wheels or its runs."""
-        refuse_steered(self.robot.geometry)
-        for run in range(len(self.dataset)):
-            require_whole_poses(self.dataset, run)
+    @property
+    def calibration_only(self) -> str | None:
+        """Reason why no force balance can be fitted, but a calibration can be; else None."""
+        if self.robot.geometry.driven is not None:
+            return NO_BALANCE
+        reasons = (incomplete_poses(self.dataset, run) for run in range(len(self.dataset)))
+        return next(filter(None, reasons), None)
 
     @cached_property
     def longest_window(self) -> float:
@@ -218,9 +220,9 @@ NO_BALANCE = (
 
 
 def refuse_steered(shape: Geometry) -> None:
-    """Raise `NoForceBalance` if a wheel is steered, which no force balance describes."""
+    """Raise `DataError` if a wheel is steered, which no force balance describes."""
     if shape.driven is not None:
-        raise NoForceBalance(NO_BALANCE)
+        raise DataError(NO_BALANCE)
 
 
 def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask:
@@ -382,13 +384,13 @@ def geometry_choices(found: Calibration, shape: Geometry, free: Collection[str])
         shape: geometry of the config.
         free: paths of the parameters that are fitted anyway.
     """
-    told = ("identified", "weak")
+    known = ("identified", "weak")
     radii = np.array([v.value for v in found.radius[found.firmest]])
     base, out = found.base[found.firmest], []
-    if found.lag.verdict in told:
+    if found.lag.verdict in known:
         lag = found.lag.value
         out.append(Choice("camera.lag", start=lag, prior_mean=lag, prior_std=LAG_STD, free=True))
-    if all(v.verdict in told for v in found.offset):
+    if all(v.verdict in known for v in found.offset):
         place = [v.value for v in found.offset]
         std = PLACE_STD * found.nominal_base
         out.append(
@@ -398,7 +400,7 @@ def geometry_choices(found: Calibration, shape: Geometry, free: Collection[str])
         )
     if "robot.wheel_radius" in free:
         out.append(Choice("robot.wheel_radius", start=float(radii.mean())))
-    if not shape.determines_twist and all(v.verdict in told for v in found.radius[found.firmest]):
+    if not shape.determines_twist and all(v.verdict in known for v in found.radius[found.firmest]):
         deviation = (radii / radii.mean() - 1).tolist()
         zero = [0.0] * len(deviation)
         out.append(
@@ -410,7 +412,7 @@ def geometry_choices(found: Calibration, shape: Geometry, free: Collection[str])
                 free=True,
             )
         )
-    if base.verdict in told and (shape.determines_twist or is_axle(shape)):
+    if base.verdict in known and (shape.determines_twist or is_axle(shape)):
         nominal = float(shape.base_radius)
         out.append(
             Choice(

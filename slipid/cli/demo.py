@@ -65,6 +65,7 @@ def run(
     Raises:
         DataError: there is no such plant, a seed is given for recorded logs, or MuJoCo is missing.
     """
+    from slipid.app.identify import checked_task
     from slipid.app.logs import packaged_config, unpack
     from slipid.cli.identify import run as identify
     from slipid.cli.validate import run as validate
@@ -82,7 +83,8 @@ def run(
         drive_anew(source, seed or 0, executor, report)
     write_bytes(out / "robotino.toml", packaged_config("robotino.toml").encode())
     result = out / "result"
-    done = identify(out / "robotino.toml", source / "fit" / "logs", result, report)
+    logs = source / "fit" / "logs"
+    done = identify(checked_task(out / "robotino.toml", logs, report), logs, result, report)
     found = validate(result, source / "unseen" / "logs", report)
     write_json(result / "validation.json", found)
     truth = read_json(

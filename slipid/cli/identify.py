@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, flag, guarded, option
-from slipid.support.errors import DataError, NoForceBalance
+from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
+    from slipid.app.calibrate import CalibrationResult
     from slipid.app.config import Config
     from slipid.app.identify import IdentifyResult
+    from slipid.app.problem import ConfigFitTask
     from slipid.report.page import Page
 
 
@@ -40,8 +42,9 @@ def identify(
     exit code is 1 if the selected models are not to be trusted: on held-out runs, a simpler model
     predicts better.
     """
-    from slipid.app.config import BenchMotors, SteeredDrive, read_config
-    from slipid.report.estimates import show_fit, show_trust
+    from slipid.app.config import BenchMotors, read_config
+    from slipid.app.identify import IdentifyResult, checked_task
+    from slipid.report.estimates import show_calibration, show_fit, show_trust
     from slipid.support.files import read_json
 
     wanted = read_config(config)
@@ -49,67 +52,53 @@ def identify(
         return bench(wanted, data, out, profile or (), json, quiet)
     if only not in (None, "calibration"):
         raise DataError(f"--only {only}: no such part; expected calibration")
-    if only or isinstance(wanted.content.robot, SteeredDrive):
-        return calibration(config, data, out, anyway, json, quiet)
-    try:
-        with Reporter(quiet=quiet) as report:
-            done = run(config, data, out, report, profile or (), anyway)
-    except NoForceBalance as error:
-        with Reporter(quiet=quiet) as report:
-            report.line(f"calibration alone: {error}")
-        return calibration(config, data, out, anyway, json, quiet)
-    content = read_json(out / "identified.json", "a result of `slipid identify`")
-
-    def show(page: "Page") -> None:
-        show_fit(page, done.fit, done.profiles)
-        show_trust(page, done.fit.trust)
-
-    emit(json, content, show, out, done.written)
-    return 1 if done.fit.trust.is_bad else 0
-
-
-def calibration(
-    config: Path, data: Path, out: Path, anyway: bool, json: str | None, quiet: bool
-) -> int:
-    """Calibrate a robot's kinematics alone, write and print the result, return the exit code."""
-    from slipid.app.calibrate import calibrate_only
-    from slipid.app.identify import checked_task
-    from slipid.app.problem import NO_BALANCE
-    from slipid.deploy.deploy import ROBOT, calibrated_robot
-    from slipid.report.estimates import show_calibration, show_trust
-    from slipid.support.files import read_json
-
     with Reporter(quiet=quiet) as report:
         task = checked_task(config, data, report, anyway)
-        done = calibrate_only(task, data, out, report)
-        models = {floor: one.model for floor, one in done.selection.items()}
-        calibrated_robot(done.calibration, task.robot, models, task.dataset).save(out / ROBOT)
-        if task.robot.geometry.driven is not None:
-            report.line(NO_BALANCE)
+        if reason := task.calibration_only:
+            report.line(f"calibration alone: {reason}")
+        if only or reason:
+            done: CalibrationResult | IdentifyResult = calibration(task, data, out, report)
+        else:
+            done = run(task, data, out, report, profile or ())
     content = read_json(out / "identified.json", "a result of `slipid identify`")
 
     def show(page: "Page") -> None:
-        show_calibration(page, done.calibration)
+        if isinstance(done, IdentifyResult):
+            show_fit(page, done.fit, done.profiles)
+        else:
+            show_calibration(page, done.calibration)
         show_trust(page, done.trust)
 
-    emit(json, content, show, out, (*done.written, ROBOT))
+    emit(json, content, show, out, done.written)
     return 1 if done.trust.is_bad else 0
 
 
+def calibration(
+    task: "ConfigFitTask", data: Path, out: Path, report: Reporter
+) -> "CalibrationResult":
+    """Return the calibration of a robot's kinematics alone, and write its results."""
+    from slipid.app.calibrate import calibrate_only
+    from slipid.deploy.deploy import ROBOT, calibrated_robot
+
+    done = calibrate_only(task, data, out, report)
+    models = {floor: one.model for floor, one in done.selection.items()}
+    calibrated_robot(done.calibration, task.robot, models, task.dataset).save(out / ROBOT)
+    return replace(done, written=(*done.written, ROBOT))
+
+
 def run(
-    config: Path,
+    task: "ConfigFitTask",
     data: Path,
     out: Path,
     report: Reporter,
     profiles: Sequence[str] = (),
-    anyway: bool = False,
 ) -> "IdentifyResult":
     """Return the fit of a robot to its logs, and write all results and pictures.
 
     Arguments are those of `slipid.app.identify.identify`.
 
     Raises:
-        DataError: config or logs are wrong; in this case nothing was written.
+        DataError: as in `slipid.app.identify.identify`.
     """
     from slipid.app.identify import identify
     from slipid.deploy.deploy import write_robot
@@ -117,7 +106,7 @@ def run(
     from slipid.plots.fit import identify_plots
     from slipid.plots.posterior import profile_figure
 
-    done = identify(config, data, out, report, profiles, anyway)
+    done = identify(task, data, out, report, profiles)
     report.stage("drawing")
     drawn = [out / name for name in write_robot(out, done.fit)]
     try:

@@ -11,7 +11,7 @@ from slipid.data.align.clock import Clock
 
 @dataclass(frozen=True)
 class WheelReading:
-    """What the angles of the wheels were computed from, for the advice of checks.
+    """Source of the wheel angles in a layout, for the advice of checks.
 
     Attributes:
         channel: channel of the layout; empty if unknown.

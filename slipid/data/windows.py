@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.data.runs import Runs, first_row
 from slipid.data.wheel_signals import interpolate
-from slipid.support.errors import DataError, NoForceBalance
+from slipid.support.errors import DataError
 
 NORMAL_STD = 0.6827
 """Probability that a normally distributed variable is within one std of its mean [1]."""
@@ -210,7 +210,8 @@ def _edges(
     """
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
-    require_whole_poses(data, run)
+    if sentence := incomplete_poses(data, run):
+        raise DataError(sentence)
     shown = time[fresh] - lag
     fresh = fresh[(fresh >= first) & (shown >= time[0] - 1e-9) & (shown <= time[-1] + 1e-9)]
     if len(fresh) < per_segment + 1:
@@ -231,20 +232,14 @@ def _edges(
     return [rows[k : k + per_segment + 1] for k in range(0, count, per_segment)]
 
 
-def has_whole_poses(data: Runs, run: int) -> bool:
-    """Return whether the poses of a run have all coordinates, and are more than two."""
-    pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
-    return len(pose) > 2 and bool(np.isfinite(pose).all())
-
-
-def require_whole_poses(data: Runs, run: int) -> None:
-    """Raise `NoForceBalance` if poses of a run lack a coordinate, or if there are at most two."""
-    if has_whole_poses(data, run):
-        return
+def incomplete_poses(data: Runs, run: int) -> str | None:
+    """Return a sentence if poses of a run lack a coordinate, or are at most two; else None."""
     pose = data.pose[data.rows(run)][data.fresh[data.rows(run)]]
     lacking = np.isnan(pose).any(axis=0)
     what = "without headings" if lacking[2] else "without positions" if lacking.any() else ""
-    raise NoForceBalance(
+    if not what and len(pose) > 2:
+        return None
+    return (
         f"{data.logs[run].name}: poses {what or f'in {len(pose)} rows only'}; expected x, y and "
         "heading during the run, which a fit of motors and contact needs. Kinematics alone can be "
         "calibrated: slipid identify --only calibration"

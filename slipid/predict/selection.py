@@ -29,7 +29,7 @@ from jaxtyping import Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
-from slipid.data.windows import has_whole_poses
+from slipid.data.windows import incomplete_poses
 from slipid.fitting.calibration.estimate import cross_calibrated, evenly
 from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.newton import newton_step
@@ -174,7 +174,7 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
     for k, runs in _picked(data, fold).items():
         calibration = without.get(k, whole)
         seen, own = calibration.seen(robot), calibrated_model(calibration, robot.geometry)
-        whole_poses = np.array([has_whole_poses(data, run) for run in runs.tolist()])
+        whole_poses = np.array([incomplete_poses(data, run) is None for run in runs.tolist()])
         for run in runs[~whole_poses].tolist():
             fitted = own.fitted[data.surface[run]]
             errors["nominal"][run] = aligned_error(data, run, plain.model, seen)

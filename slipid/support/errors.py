@@ -12,10 +12,6 @@ class DataError(ValueError):
     """
 
 
-class NoForceBalance(DataError):
-    """Error about runs or wheels for which no force balance is fitted, but a calibration can be."""
-
-
 def bad_data(
     path: Path | str,
     found: str,

@@ -189,7 +189,7 @@ def test_without_turns_the_track_is_not_identified():
 
 def test_one_speed_is_said_with_what_it_does_not_tell():
     said = judged(SQUARES)[1]
-    assert "one speed alone on floor (0.2 m/s): whether slip grows with speed" in said
+    assert "one speed alone on floor (0.2 m/s): the runs do not show whether slip grows" in said
     assert "nearly one number" not in said
     assert "one speed" not in judged(MIXED)[1]
 

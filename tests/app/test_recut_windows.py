@@ -69,7 +69,7 @@ def test_a_fit_goes_on_with_windows_at_the_lag_it_found(task, monkeypatch):
 
 def test_chains_are_of_windows_and_choices_as_the_fit_has_them(monkeypatch, tmp_path):
     class Asked(Exception):
-        """What the problem was to be near, and its choices."""
+        """The robot that the problem was near, and its choices."""
 
     @dataclass
     class Job:

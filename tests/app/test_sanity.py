@@ -8,7 +8,7 @@ import pytest
 
 from slipid.app.check import sanity
 from slipid.app.config import FitSection, read_config
-from slipid.app.identify import identify
+from slipid.app.identify import checked_task
 from slipid.app.problem import FitTask, read_fit_task
 from slipid.model.robot import Robot
 from slipid.search_space import Space
@@ -52,7 +52,7 @@ def test_a_gear_that_is_wrong_in_both_places_is_named(tmp_path):
 def test_identify_refuses_and_names_the_option_to_go_on(tmp_path):
     file = config(tmp_path, ROBOT.replace("mass_kg = 12.0\n", ""))
     with pytest.raises(DataError, match=r"(?s)1\. mass_kg \(.*into \[robot\].*--anyway"):
-        identify(file, tmp_path / "logs", tmp_path / "out", Reporter(quiet=True))
+        checked_task(file, tmp_path / "logs", Reporter(quiet=True))
     assert not (tmp_path / "out").exists()
     words = ("--data", tmp_path / "logs", "--out", tmp_path / "out", "--quiet")
     assert invoke("identify", file, *words).exit_code == 2

@@ -1,4 +1,4 @@
-"""Where wheels rest during a part of a window, friction is that of the rest of the window."""
+"""Friction of a window in which wheels rest for a part: it is that of the part that moves."""
 
 from __future__ import annotations
 

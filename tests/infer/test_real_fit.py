@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from slipid.app.compare import validate
-from slipid.app.identify import identify
+from slipid.app.identify import checked_task, identify
 from slipid.support.progress import Reporter
 from tests.helpers import golden_rows as rows
 
@@ -20,7 +20,8 @@ pytestmark = pytest.mark.slow  # fits 472 runs
 @pytest.fixture(scope="module")
 def out(real_data, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("robotino2022")
-    done = identify(CONFIG, real_data / "robotino2022", folder, Reporter(quiet=True))
+    logs, report = real_data / "robotino2022", Reporter(quiet=True)
+    done = identify(checked_task(CONFIG, logs, report), logs, folder, report)
     assert done.fit.converged
     return folder
 

@@ -88,6 +88,11 @@ NOT_CALIBRATED = frozenset(
 would be meaningless."""
 
 
+LEAST_TURN_RAD, ROUNDING_RAD = 0.5, 1e-6
+"""A run's heading is judged if the wheels turn the robot by more than the first angle, and is
+constant if its range is below the second one [rad]."""
+
+
 def heading_constant(turned: float, runs: Sequence[str], count: int) -> Finding:
     """Return the finding that the heading of the poses never changes in runs that turn.
 

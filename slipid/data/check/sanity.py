@@ -28,6 +28,8 @@ from slipid.data.check.columns import (
     misordered,
 )
 from slipid.data.check.findings import (
+    LEAST_TURN_RAD,
+    ROUNDING_RAD,
     Finding,
     cause_findings,
     heading_constant,
@@ -208,7 +210,7 @@ def _compared(
     meant, found = mistakes(evidence)
     agreeing = agreement(data, at, moved, evidence, meant)
     fixed = agreeing.heading_fixed
-    if fixed.any() and fixed.mean() >= SHARE_IF_ALL:  # no order or axis can be told without it
+    if fixed.any() and fixed.mean() >= SHARE_IF_ALL:  # without it, order and axes cannot be judged
         return _Compared((_heading_constant(data, agreeing),), moved, evidence)
     left = misfits(evidence, meant)["pose"]
     if left > UNEXPLAINED_IF_FOREIGN:
@@ -306,8 +308,8 @@ def _notes(data: JoinedRuns, evidence: Evidence, meant: Interpretation) -> Itera
             yield _not_checked("no run drives sideways: order and signs are only partly checked")
     if evidence.twist is None and evidence.command is None:
         yield _not_checked(
-            "no command is logged, so logged wheel rotations that are too large cannot be told "
-            "from slip"
+            "no command is logged, so logged wheel rotations that are too large cannot be "
+            "distinguished from slip"
         )
     if "current" in data.channels and not data.current_is_signed:
         yield _not_checked("currents are magnitudes: their signs cannot be checked")
@@ -326,9 +328,6 @@ LEAST_PATH_M = 0.2
 [m]."""
 ROUNDING_M = 1e-6
 """Poses with a path shorter than this are constant, except for rounding [m]."""
-LEAST_TURN_RAD, ROUNDING_RAD = 0.5, 1e-6
-"""A run's heading is judged if the wheels turn the robot by more than the first angle, and is
-constant if its range is below the second one [rad]."""
 LEAST_ROWS = 20
 """Runs with fewer rows are not judged."""
 ODD_DISAGREEMENT, ODD_RATIO, USUAL_COSINE = 0.3, 10.0, 0.9
@@ -387,7 +386,7 @@ def agreement(
 ) -> RunAgreement:
     """Return the agreement of poses with wheels in every run, under an interpretation."""
     convention = meant.convention
-    # Not shifted by the lag of the poses, which cannot be told from a constant heading.
+    # Not shifted by the lag of the poses, which a constant heading does not show.
     turned = increments(data, at, 0.0).wheels @ to_body(evidence, meant)[2] / evidence.base
     wheels_rad, poses_rad = (
         np.array([_range(of[at.run == k]) for k in range(len(data.names))])

@@ -6,7 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.align.lag import pose_lag
-from slipid.data.check.findings import Finding, heading_constant
+from slipid.data.check.findings import (
+    LEAST_TURN_RAD,
+    ROUNDING_RAD,
+    Finding,
+    heading_constant,
+)
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_steps, integral, interpolate
 from slipid.model.geometry import Geometry
@@ -15,9 +20,6 @@ STEP_S = 0.2
 """Shortest duration of the compared pose increments [s]."""
 LEAST_CORRELATION = 0.5
 """Smallest magnitude of the correlation of two motions at which their ratio is judged [1]."""
-LEAST_TURN_RAD, ROUNDING_RAD = 0.5, 1e-6
-"""If wheels and steering turn the robot by more than the first angle [rad], and the heading of the
-poses by less than the second one, the heading is constant."""
 NATURAL = 0.67, 1.5
 """Range of the ratio of the poses' motion to that of wheels and steering without a finding [1]."""
 

@@ -18,9 +18,9 @@ weighted by a Student t, plus a Gaussian prior. The variances of poses and motio
 maximum likelihood in turn. Intervals are from a jackknife over runs, since the kinematics are wrong
 somewhere and errors of a run are alike; they are at least as wide as those of the likelihood.
 
-Straight driving tells the steering's zero, and turns tell gain over wheelbase. Gain and wheelbase
-apart follow from large angles alone, by the tangent, so that both have priors: the config's
-wheelbase within 5 %, and a gain of 1 within .1.
+Straight driving determines the steering's zero, and turns determine gain over wheelbase. Gain and
+wheelbase apart follow from large angles alone, by the tangent, so that both have priors: the
+config's wheelbase within 5 %, and a gain of 1 within .1.
 
 Source: least squares for the same numbers on square paths, Borenstein and Feng 1996, "Measurement
 and correction of systematic odometry errors in mobile robots" (UMBmark), IEEE Transactions on

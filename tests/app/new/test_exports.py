@@ -57,7 +57,9 @@ def test_dates_are_times(tmp_path, text):
 @pytest.mark.parametrize("unit", ["ns", "us", "ms"])
 @pytest.mark.parametrize("zone", [None, "UTC"])
 def test_dates_in_parquet_are_times(tmp_path, unit, zone):
-    pyarrow = pytest.importorskip("pyarrow")
+    pyarrow = pytest.importorskip(
+        "pyarrow", reason="Parquet needs slipid[parquet], which the development environment has"
+    )
     from pyarrow import parquet
 
     stamps = pyarrow.array(dates(lambda date: date.replace(tzinfo=None)))

@@ -246,7 +246,7 @@ def _electric(
 
 @dataclass(frozen=True)
 class Judged:
-    """What is true of a fresh run: path length, and the sensor at the first and the last pose."""
+    """Truth of a fresh run: path length, and the sensor at the first and the last pose."""
 
     path: float
     start: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""What slipid makes of a robot's logs: calibration, `slipid identify`, and `slipid validate`."""
+"""Results of slipid for a robot's logs: calibration, `slipid identify`, and `slipid validate`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Rows = dict[str, dict[str, float]]
 
 @dataclass(frozen=True)
 class Answer:
-    """What slipid says of a robot.
+    """Answer of slipid about a robot.
 
     Attributes:
         verdict: verdict of trust, or why there is none.
@@ -109,7 +109,7 @@ def _rows(runs: Iterable[dict], truth: dict[str, Judged]) -> Rows:
 
 
 def covered(robot: MadeRobot, calibration: dict) -> dict[str, bool]:
-    """Whether the intervals of `calibration` in identified.json hold the true numbers."""
+    """Return, for each number of the calibration, whether its interval holds the true one."""
     stated = {"lag": calibration["pose_lag_s"]}
     stated |= dict(zip(("place x", "place y"), calibration["pose_offset_m"], strict=True))
     for floor, centre in calibration.get("centre_of_rotation_m", {}).items():
@@ -129,7 +129,7 @@ def covered(robot: MadeRobot, calibration: dict) -> dict[str, bool]:
 
 
 def covered_motors(robot: MadeRobot, parameters: dict) -> dict[str, bool]:
-    """Whether the intervals of the motors' numbers in identified.json hold the true ones."""
+    """Return, for each number of the motors, whether its interval holds the true one."""
     if robot.motors is None:
         return {}
     right = {

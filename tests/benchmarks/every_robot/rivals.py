@@ -1,4 +1,4 @@
-"""What a user would do without slipid: nominal numbers, or robust least squares with scipy.
+"""Rivals that a user has without slipid: nominal numbers, or robust least squares with scipy.
 
 The equations are written again here, not taken from `drive`, and logs are read from their files.
 """

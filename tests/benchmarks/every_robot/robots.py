@@ -129,12 +129,12 @@ class MadeRobot:
 
     @property
     def has_kinematics(self) -> bool:
-        """Whether radii and bases are all there is to know: no floor makes load-dependent slip."""
+        """True if radii and bases are all there is to know: no floor makes load-dependent slip."""
         return all(floor.grip is None for floor in self.floors)
 
     @property
     def determined(self) -> bool:
-        """Whether kinematics are all there is to know, and the training runs tell all of them."""
+        """True if kinematics are all there is to know, and the training runs show all of them."""
         told = self.paths != "straight" and self.pose_kind != "heading" and not self.wrong_label
         return told and self.has_kinematics
 
@@ -146,9 +146,17 @@ OMNI3, OMNI4 = (60.0, 180.0, 300.0), (45.0, 135.0, 225.0, 315.0)
 MOTORS = Motors(0.9, 0.045, 12.0, 0.06, 0.012, 0.02)
 
 
-def alike(name: str, radius: float, drives: int, base: float, **more: object) -> Floor:
-    """A floor on which all drives have one radius."""
-    return Floor(name, (radius,) * drives, base, **more)  # type: ignore[arg-type]
+def alike(
+    name: str,
+    radius: float,
+    drives: int,
+    base: float,
+    centre: float = 0.0,
+    grip: Grip | None = None,
+    understeer: float = 0.0,
+) -> Floor:
+    """Return a floor on which all drives have one radius."""
+    return Floor(name, (radius,) * drives, base, centre, grip, understeer)
 
 
 ROBOTS = (

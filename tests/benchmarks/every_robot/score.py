@@ -91,7 +91,7 @@ def numbers(robot: MadeRobot) -> dict[str, Number]:
 
 
 def covered(robot: MadeRobot, fitted: Fitted) -> dict[str, bool]:
-    """Whether the 90 % interval of each number holds the true one."""
+    """Return, for each number, whether its 90 % interval holds the true one."""
     truth, found = true(robot), {}
     for name, number in numbers(robot).items():
         low, high = fitted.interval(number)

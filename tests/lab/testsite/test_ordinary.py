@@ -26,7 +26,9 @@ from slipid.support.progress import Reporter
 from tests.conftest import ROOT
 from tests.helpers.one_log import read_log
 
-mujoco = pytest.importorskip("mujoco")
+mujoco = pytest.importorskip(
+    "mujoco", reason="the test site needs slipid[testsite], which the development environment has"
+)
 
 SKID = OrdinaryBuild(
     drive="skid",

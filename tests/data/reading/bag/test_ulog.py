@@ -52,7 +52,9 @@ def log(tmp_path):
 
 
 def test_topics_come_back(log):
-    pytest.importorskip("pyulog")
+    pytest.importorskip(
+        "pyulog", reason="ULog files need slipid[ulog], which the development environment has"
+    )
     topics = {
         "wheel_angle": {"topic": "wheel_encoders"},
         "wheel_speed": {"topic": "wheel_encoders"},
@@ -77,14 +79,18 @@ def test_topics_come_back(log):
 
 
 def test_a_pose_may_have_a_quaternion_that_begins_with_w(log):
-    pytest.importorskip("pyulog")
+    pytest.importorskip(
+        "pyulog", reason="ULog files need slipid[ulog], which the development environment has"
+    )
     run = read(log, topics={"pose": {"topic": "vehicle_visual_odometry"}})
     np.testing.assert_allclose(run.signals["pose_heading"].values[:, 0], -TURN, atol=1e-6)
     np.testing.assert_allclose(run.signals["pose_y"].values[:, 0], -2 * TURN, atol=1e-6)
 
 
 def test_topics_are_described_and_proposed(log):
-    pytest.importorskip("pyulog")
+    pytest.importorskip(
+        "pyulog", reason="ULog files need slipid[ulog], which the development environment has"
+    )
     found = {topic.name: topic for topic in topics_of(log)}
     assert found["wheel_encoders"].serves == ("wheel_angle", "wheel_speed")
     assert found["vehicle_local_position"].serves == ("pose",)
@@ -98,7 +104,9 @@ def test_topics_are_described_and_proposed(log):
 
 
 def test_a_damaged_log_is_named(log):
-    pytest.importorskip("pyulog")
+    pytest.importorskip(
+        "pyulog", reason="ULog files need slipid[ulog], which the development environment has"
+    )
     log.write_bytes(log.read_bytes()[:12])
     with pytest.raises(DataError, match=r"run\.ulg: the bag is damaged.*from the robot again"):
         topics_of(log)
