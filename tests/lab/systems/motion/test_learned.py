@@ -149,12 +149,18 @@ def test_a_neural_network_learns_how_slip_turns_with_the_direction():
         return slipping(angle, [-0.3 * np.cos(angle), 0.2 * np.sin(angle), 0.1 * np.cos(2 * angle)])
 
     method = NeuralNetwork().fit([run(angle) for angle in np.linspace(0, 6.2, 60)], ROBOTINO)
-    for angle in (0.33, 2.9, 5.0):
-        new = run(angle)
-        (predicted,) = method.predict([new.signals], ROBOTINO)
-        error = predicted.path[-1] - path_of(new.twist, new.signals.dt)[-1]
-        assert np.hypot(*error[:2]) < 0.02 * 0.8
-        assert abs(error[2]) < 0.05
+    new = [run(angle) for angle in np.linspace(0.1, 6.1, 16)]
+    predicted = method.predict([run.signals for run in new], ROBOTINO)
+    errors = np.abs(
+        [
+            of_run.path[-1] - path_of(run.twist, run.signals.dt)[-1]
+            for of_run, run in zip(predicted, new, strict=True)
+        ]
+    )
+    # Slip moves the end point by 0.20 m on average. A single direction may be off by a tenth of
+    # that, depending on the seed and the processor; the mean over directions hardly varies.
+    assert np.hypot(errors[:, 0], errors[:, 1]).mean() < 0.012
+    assert errors[:, 2].mean() < 0.015
 
 
 def test_the_numbers_of_a_network_are_its_weights():
