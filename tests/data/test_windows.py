@@ -421,7 +421,9 @@ def test_direction_at_a_steady_speed_is_that_of_the_motor():
 
     for speed in (0.1, -0.3, 2.0):
         w = windows(collect([swing(lambda t, v=speed: np.full_like(t, v))]), RADIUS)
-        np.testing.assert_allclose(w.direction, sign_of_motion(jnp.array([speed])).item(), atol=2e-3)
+        np.testing.assert_allclose(
+            w.direction, sign_of_motion(jnp.array([speed])).item(), atol=2e-3
+        )
 
 
 def test_directions_of_a_reversal_cancel_in_signed_currents_alone():
