@@ -40,7 +40,7 @@ def identify(
 
     Writes identified.json, fit.json, robot.json and pictures. An interrupted fit is continued. The
     exit code is 1 if the selected models are not to be trusted: on held-out runs, a simpler model
-    predicts better.
+    predicts better, or a selected force balance did not converge or is not plausible.
     """
     from slipid.app.config import BenchMotors, read_config
     from slipid.app.identify import IdentifyResult, checked_task

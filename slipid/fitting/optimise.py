@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from slipid.fitting import likelihood as lk
 from slipid.fitting.hierarchy import axis_effects, effect_variances, pooled
@@ -36,7 +36,14 @@ from slipid.fitting.variances import (
     fitted_covariance,
     scoring_step,
 )
+from slipid.search_space import Space
 
+LENGTHS = ("robot.wheel_radius", "robot.radius_deviation", "robot.base_radius")
+"""Paths of the lengths of the robot that slip can imitate."""
+HELD_ROUNDS = 2
+"""Number of rounds from the start in which these lengths do not move."""
+SAME_LENGTHS = 0.02
+"""Largest difference between lengths that are taken for the same, relative [1]."""
 _MOST_REFUSED = 12
 """Largest number of steps that the solver may refuse in a round."""
 
@@ -72,6 +79,10 @@ def optimise(
 ) -> Optimum:
     """Return the maximum a posteriori, searched from `staged_start` or from a given state.
 
+    The lengths of the robot stay where they start in the first `HELD_ROUNDS` rounds. With outliers
+    and variances of the noise still unknown, lengths that move at once can end in an optimum where
+    they stand for slip.
+
     Args:
         keep: 1 for segments that are fitted, 0 for held-out ones, in the order of
             `Problem.full_weight`; all 1 by default. Folds of a cross-validation differ in this
@@ -87,14 +98,16 @@ def optimise(
     keep = problem.full_weight if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
     mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
+    lengths = _lengths(problem.space)
     history: list[float] = []
     while state.round < most_rounds:
-        early = state.round < 3
+        early, held = state.round < 3, state.round < HELD_ROUNDS
         scoring = (2 if early else 4) if variances else 0
-        state = one_round(problem, state, keep, mask, steps=8 if early else 4, scoring=scoring)
+        may_move = mask * ~lengths if held else mask
+        state = one_round(problem, state, keep, may_move, steps=8 if early else 4, scoring=scoring)
         history.append(state.loss)
         tell(state)
-        if state.moved < tolerance:
+        if state.moved < tolerance and not held:
             break
     covariance = problem.laplace(state.z, state.log_variance, keep)
     reason = f"{most_rounds} rounds without convergence"
@@ -187,7 +200,30 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
 
     While all other parameters are fixed, floors have no parameter in common, so that one fit in
     which only the floors' parameters may move fits each floor independently. The start with the
-    least loss is chosen floor by floor.
+    least loss is chosen floor by floor. Lengths may start from a calibration, which slip has made
+    shorter; if they differ from the means of their priors, all is repeated from those means, and
+    the better of the two is chosen.
+    """
+    space = problem.space
+    first, lengths = _motor_start(problem, keep), _lengths(space)
+    found, loss = _floors_fitted(problem, keep, tell, first, "")
+    if np.abs(first - space.prior_mean)[lengths].max(initial=0.0) > SAME_LENGTHS:
+        again = np.where(lengths, space.prior_mean, first)
+        other, loss_of_other = _floors_fitted(problem, keep, tell, again, ", lengths of the config")
+        found = other if loss_of_other < loss else found
+    return found
+
+
+def _floors_fitted(
+    problem: Problem,
+    keep: np.ndarray,
+    tell: Callable[[FitState], None],
+    first: np.ndarray,
+    remark: str,
+) -> tuple[FitState, float]:
+    """Return a start vector with each floor fitted, and its loss but for a factor and an offset.
+
+    `first` is the vector before, and `remark` is told with the stage.
     """
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)
@@ -196,13 +232,12 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
     usual = {"camera": 1.0, "pooled": 1.0} | dict.fromkeys(SHARED, 0.1)
     wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
-    first = _motor_start(problem, keep)
     independent = problem.without_shared_effects()
     best, z = np.full(len(labels), np.inf), first.copy()
     floors = np.asarray(problem.batch.surface)
     of_floor = np.repeat([e.surface or "" for e in space.free], [e.coordinates for e in space.free])
     for attempt, value in enumerate(CREEPS):
-        stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
+        stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}{remark}"
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
         # Many steps at first, since the damping starts at 1, far below the scale of the problem.
@@ -218,7 +253,12 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
             if mine < best[number]:
                 best[number] = mine
                 z = np.where(of_floor == label, state.z, z)
-    return FitState(z, log_v, 0, np.inf, np.inf, "joint")
+    return FitState(z, log_v, 0, np.inf, np.inf, "joint"), float(best.sum())
+
+
+def _lengths(space: Space) -> Bool[np.ndarray, " free"]:
+    """Return True for the coordinates of the lengths of the robot."""
+    return space.where(lambda e: e.path in LENGTHS)
 
 
 def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:

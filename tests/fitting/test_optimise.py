@@ -44,6 +44,7 @@ SURFACE = [
     Choice("robot.load_share@*", free=True),
     Choice("camera.marker_yaw", free=True),
     Choice("camera.session_yaw@*", fixed=0.0),
+    Choice("robot.wheel_radius", prior_mean=0.04, prior_std=0.004),
 ]
 
 LEVEL = ("camera.scale", "camera.radial", "motor.resistance", "motor.back_emf")
@@ -288,12 +289,22 @@ def test_a_run_gone_wrong_hardly_counts(surface_problem, surface_fit):
     assert float(weight[5]) < 0.05 * float(np.median(weight))
 
 
-def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fit):
+@pytest.mark.parametrize("radius", [0.04, 0.034])
+def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fit, radius):
+    """Also from a radius that slip has made shorter: the slip is that of the config's radius."""
     best, _ = surface_fit
-    found = optimise(surface_problem, tolerance=1e-3, most_rounds=100)
+    start = Choice("robot.wheel_radius", start=radius, prior_mean=0.04, prior_std=0.004)
+    problem = Problem(surface_problem.windows, surface_problem.robot, [*SURFACE[:-1], start])
+    assert value(problem, begin(problem), "robot.wheel_radius") == pytest.approx(radius)
+    told = []
+    found = optimise(problem, tolerance=2e-4, most_rounds=100, tell=told.append)
     assert found.converged, found.reason
     std = np.sqrt(np.diag(best.covariance))
-    np.testing.assert_allclose(found.state.z / std, best.state.z / std, atol=0.02)
+    np.testing.assert_allclose(found.state.z / std, best.state.z / std, atol=0.05)
+    joint = [s for s in told if s.stage == "joint"]
+    radii = [float(value(problem, s, "robot.wheel_radius")) for s in joint]
+    assert radii[0] == radii[1] == pytest.approx(0.04)
+    assert radii[2] != radii[1]
 
 
 # what is compiled

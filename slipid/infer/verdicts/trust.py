@@ -103,7 +103,7 @@ def verdict_of_trust(
     uses_contact = any(floor.model == "contact" for floor in floors.values())
     about_contact = list(_of_numbers(numbers))
     if not converged:
-        about_contact.append((1, "the fit of the force balance did not converge"))
+        about_contact.append((2, "the fit of the force balance did not converge"))
     verdicts = {e.verdict for e in numbers} - {"fixed"}
     if verdicts and not verdicts & {"identified", "weak", "disputed"}:
         about_contact.append((1, "the logs determine no parameter of the fit"))

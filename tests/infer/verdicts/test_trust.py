@@ -41,7 +41,7 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
 @pytest.mark.parametrize(
     ("floors", "converged", "numbers", "word", "reason_text"),
     [
-        (GOOD, False, [number()], "doubtful", "did not converge"),
+        (GOOD, False, [number()], "not to be trusted", "did not converge"),
         (
             {"ice": floor(nominal=0.02, calibrated=0.05, contact=0.03)},
             True,
