@@ -78,6 +78,11 @@ def remarks(
     """
     c = found.calibration
     out = list(found.suspects)
+    if not c.settled:
+        out.append(
+            "the calibration had not settled when it ended, so that its intervals may be too "
+            "narrow: drive more runs, with turns and straight parts at several speeds"
+        )
     what = "base" if c.sideways else "track"
     far_base = _is_absurd(c.base[c.firmest].value / c.nominal_base)
     straight = [f for f, v in c.base.items() if v.verdict == "not_identified" and not far_base]

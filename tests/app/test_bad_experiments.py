@@ -223,3 +223,12 @@ def test_wheels_that_slip_far_on_one_of_two_floors_are_identified_there():
     assert {v.verdict for row in calibration.radius.values() for v in row} == {"identified"}
     assert calibration.radius["soft"][0].value == pytest.approx(0.25 * 0.05, rel=0.02)
     assert "is not to be trusted" not in said
+
+
+def test_a_calibration_that_still_changes_when_it_ends_is_reported(monkeypatch):
+    assert judged(SQUARES)[0].settled
+    assert "had not settled" not in judged(SQUARES)[1]
+    monkeypatch.setattr("slipid.fitting.calibration.estimate.MOST_ROUNDS", 1)
+    found, remarked = judged.__wrapped__(SQUARES)
+    assert not found.settled
+    assert "the calibration had not settled when it ended" in remarked

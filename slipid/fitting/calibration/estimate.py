@@ -102,6 +102,7 @@ class _Fit:
             six of the motion, as in `innovations`.
         weight: weight of each track [1].
         runs: indices of the runs from which tracks are cut, None for all.
+        settled: True if no number changed by `SETTLED` stds or more in the last round.
     """
 
     model: CalibrationSpace
@@ -111,6 +112,7 @@ class _Fit:
     log_variance: Float[np.ndarray, " variance"]
     weight: Float[np.ndarray, " track"]
     runs: Int[np.ndarray, " some"] | None = None
+    settled: bool = True
 
     @cached_property
     def floor(self) -> Int[np.ndarray, " track"]:
@@ -334,8 +336,8 @@ def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
             fit.model.firmest == before.model.firmest
             and _in_stds(fit.z - before.z, fit.gradient[1]) < SETTLED
         ):
-            break
-    return fit
+            return replace(fit, settled=True)
+    return replace(fit, settled=False)
 
 
 def evenly(floors: Sequence[str] | np.ndarray, most: int) -> Int[np.ndarray, " some"]:
@@ -504,6 +506,7 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         nominal_base=base,
         noise=_noise(fit),
         runs=len(fit.data),
+        settled=fit.settled,
     )
 
 

@@ -85,6 +85,7 @@ class Calibration:
         nominal_radius, nominal_base: lengths of the config [m].
         noise: stds of poses and motion.
         runs: number of calibrated runs.
+        settled: False if the numbers still changed in the last round of the calibration.
     """
 
     sideways: bool
@@ -103,6 +104,7 @@ class Calibration:
     nominal_base: float
     noise: MotionNoise
     runs: int
+    settled: bool
 
     def __str__(self) -> str:
         return "\n".join(self.sentences)
@@ -235,6 +237,7 @@ class Calibration:
             "firmest": self.firmest,
             "noise": asdict(self.noise),
             "runs": self.runs,
+            "settled": self.settled,
         }
 
     @classmethod
@@ -270,6 +273,7 @@ class Calibration:
                 noise["place"], noise["heading"], stds(noise["process"]), stds(noise["effect"])
             ),
             runs=content["runs"],
+            settled=content["settled"],
         )
 
 
