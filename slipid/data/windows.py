@@ -51,6 +51,8 @@ class Windows:
         has_voltage: True if all runs have logged voltages.
         current_is_signed: False if `current` is a mean of magnitudes.
         lag: assumed lag of the camera behind the encoders [s].
+        parts: number of windows from one measured pose to the next; poses at the edges between them
+            are interpolated.
     """
 
     run: Int[np.ndarray, " segment"]
@@ -71,6 +73,7 @@ class Windows:
     has_voltage: bool
     current_is_signed: bool
     lag: float
+    parts: int = 1
 
     def __len__(self) -> int:
         return len(self.run)
@@ -92,7 +95,12 @@ class Windows:
 
 
 def windows(
-    data: Runs, wheel_radius: float, lag: float = 0.0, per_segment: int = 4, longest: float = 6.0
+    data: Runs,
+    wheel_radius: float,
+    lag: float = 0.0,
+    per_segment: int = 4,
+    longest: float = 6.0,
+    parts: int = 1,
 ) -> Windows:
     """Return the runs divided into segments of `per_segment` windows, from their first motion on.
 
@@ -102,6 +110,7 @@ def windows(
         lag: lag of the camera behind the encoders [s].
         per_segment: number of windows in each segment.
         longest: largest duration of a window [s]; longer runs have more segments.
+        parts: number of equal parts into which every window is divided in turn.
 
     Raises:
         DataError: no wheel of a run moves by `MOVED_M`, or a run has too few poses for its windows,
@@ -111,7 +120,7 @@ def windows(
     run = [k for k, segments in enumerate(each) for _ in segments]
     noise = ammeter_variance(data)
     segments = [
-        _cut(data, k, edges, lag, noise[k]) for k, cuts in enumerate(each) for edges in cuts
+        _cut(data, k, edges, lag, noise[k], parts) for k, cuts in enumerate(each) for edges in cuts
     ]
     together = {name: np.stack([segment[name] for segment in segments]) for name in segments[0]}
     logs = [data.logs[k] for k in run]
@@ -125,6 +134,7 @@ def windows(
         has_voltage=data.voltage is not None,
         current_is_signed=data.current_is_signed,
         lag=lag,
+        parts=parts,
     )
 
 
@@ -247,7 +257,12 @@ def incomplete_poses(data: Runs, run: int) -> str | None:
 
 
 def _cut(
-    data: Runs, run: int, edges: np.ndarray, lag: float, noise: Float[np.ndarray, " wheel"]
+    data: Runs,
+    run: int,
+    edges: np.ndarray,
+    lag: float,
+    noise: Float[np.ndarray, " wheel"],
+    parts: int,
 ) -> dict[str, np.ndarray]:
     """Return the arrays of `Windows` for one segment, keyed by the name of the attribute.
 
@@ -257,10 +272,14 @@ def _cut(
         edges: rows of the run at the edges of the windows.
         lag: lag of the camera behind the encoders [s].
         noise: variance of a single reading of each ammeter [A^2].
+        parts: number of equal parts of each window.
     """
     rows = data.rows(run)
     t, angle = data.time[rows], data.turned(run)
-    at = t[edges] - lag
+    part = np.arange(parts * (len(edges) - 1) + 1) / parts
+    logged = np.column_stack([t, data.pose[rows]])[edges]
+    shown, *pose = interpolate(np.arange(len(edges)), logged, part).T
+    at = shown - lag
     half = SPEED_S / 2
     turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))
     span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
@@ -275,7 +294,7 @@ def _cut(
     ) -> tuple[PerWindow, PerWindow]:
         """Return the mean of a current or voltage in each window, and the variance of the mean."""
         if values is None:
-            zero = np.zeros((len(edges) - 1, angle.shape[1]))
+            zero = np.zeros((len(at) - 1, angle.shape[1]))
             return zero, zero
         read = None if fresh is None else fresh[rows]
         mean, count, missed = _mean(t, values, data.live[rows], read, at)
@@ -287,11 +306,11 @@ def _cut(
     direction = _direction(t, angle, data.live[rows], at, data.current_is_signed)
     return {
         "start": np.asarray(t[edges[0]]),
-        "dt": np.diff(t[edges]),
+        "dt": np.diff(shown),
         "turn": turn,
         "speed_change": np.diff(speed, axis=0),
         "direction": direction if data.current_is_signed else direction * np.sign(turn),
-        "pose": data.pose[rows][edges],
+        "pose": np.stack(pose, axis=-1),
         "current": mean_current,
         "voltage": mean_voltage,
         "current_var": current_var,

@@ -14,17 +14,21 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.data.runs import Runs
+from slipid.data.wheel_signals import interpolate
 from slipid.data.windows import Windows, windows
 from slipid.fitting import likelihood as lk
 from slipid.fitting.noise import travel
 from slipid.fitting.session_effects import by_axis
 from slipid.model import se2
 from slipid.model.robot import Robot
-from slipid.predict.slip_model import turned, turned_left
+from slipid.predict.slip_model import RobotSpec, RunSignals, path_of, turned, turned_left
 from slipid.search_space import Space
 
 LONGEST_STEP_S = 0.5
-"""Longest step in which the path of a run is predicted [s]."""
+"""Longest step in which the path of a run with steady wheels is predicted [s]."""
+MOST_PARTS, SAME_PATH = 32, 5e-4
+"""Largest number of parts of a step, and largest difference of the rolled path from that of so many
+parts, over the path length [1]."""
 Numbers = Array | np.ndarray
 RUNS_PER_CALL = 32
 """Number of runs that are predicted in one compiled call."""
@@ -53,7 +57,8 @@ class Tracks:
 def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
     """Return the runs, each as one segment of short steps, `RUNS_PER_CALL` at a time.
 
-    The number of steps of a run is a power of two, so that few array shapes are compiled.
+    The number of steps of a run is a power of two, so that few array shapes are compiled. A step
+    has one twist. Where wheels change their speeds within steps, the run's steps are divided.
     """
     steps = []
     for k, log in enumerate(data.logs):
@@ -62,22 +67,53 @@ def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
         while want > 1 and want > frames // 3:
             want //= 2
         steps.append(want)
-    return whole_runs(data, robot, steps)
+    return whole_runs(
+        data, robot, steps, [parts_of_steps(data, k, robot, n) for k, n in enumerate(steps)]
+    )
 
 
-def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
+def parts_of_steps(data: Runs, run: int, robot: Robot, steps: int) -> int:
+    """Return the number of parts of each step in which a run's wheels are nearly steady."""
+    rows, spec = data.rows(run), RobotSpec.of(robot)
+    time, angle = data.time[rows], data.turned(run)
+
+    def path(parts: int) -> Float[np.ndarray, "edge 3"]:
+        edges = np.linspace(time[0], time[-1], steps * parts + 1)
+        turn = np.diff(interpolate(time, angle, edges), axis=0)
+        rolled = RunSignals(data.logs[run].name, np.diff(edges), turn)
+        return path_of(rolled.rolling(spec), rolled.dt)
+
+    exact, parts = path(MOST_PARTS), 1
+    length = float(np.linalg.norm(np.diff(exact[:, :2], axis=0), axis=1).sum())
+    while parts < MOST_PARTS:
+        gap = path(parts)[::parts, :2] - exact[::MOST_PARTS, :2]
+        if float(np.linalg.norm(gap, axis=1).max()) <= SAME_PATH * length:
+            break
+        parts *= 2
+    return parts
+
+
+def whole_runs(
+    data: Runs, robot: Robot, steps: Sequence[int], parts: Sequence[int] | None = None
+) -> list[Windows]:
     """Return the runs, each as one segment of a given number of steps, `RUNS_PER_CALL` at a time.
 
     The last run of an incomplete group is repeated to fill the group, so that few array shapes are
     compiled.
+
+    Args:
+        data: the runs.
+        robot: robot with the lag of the pose sensor.
+        steps: number of steps of each run.
+        parts: number of parts of each step, for each run; 1 by default.
     """
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
-    out = []
-    for count in sorted(set(steps)):
-        runs = np.flatnonzero(np.asarray(steps) == count)
+    shapes, out = list(zip(steps, parts or [1] * len(steps), strict=True)), []
+    for shape in sorted(set(shapes)):
+        runs = np.array([k for k, own in enumerate(shapes) if own == shape])
         for first in range(0, len(runs), RUNS_PER_CALL):
             some = runs[first : first + RUNS_PER_CALL]
-            w = windows(data.subset(some), radius, lag, per_segment=count, longest=np.inf)
+            w = windows(data.subset(some), radius, lag, shape[0], np.inf, shape[1])
             filled = np.minimum(np.arange(RUNS_PER_CALL), len(w) - 1)
             out.append(replace(w, run=some[w.run]).segments(filled))
     return out

@@ -186,7 +186,7 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
                 cases |= {f: (own, replace(w, surface=(f,) * len(w))) for f in floors}
             for name, (model, at) in cases.items():
                 tracks = replay.tracks_from_increments(seen, w, model.increments(at, seen))
-                errors[name][runs[tracks.run]] = path_errors(tracks)
+                errors[name][runs[tracks.run]] = path_errors(tracks, w.parts)
     kept = {name: errors[name] for name in MODELS[:2]}
     return KinematicFit(whole, kept, tuple(_mislabelled(data, errors, floors)))
 
@@ -280,7 +280,7 @@ def contact_errors(data: Runs, problem: Problem, optimum: Optimum) -> Float[np.n
         model = force_balance_of(problem, moved, np.linalg.inv(step.information), keep)
         for w in replay.replay_windows(data.subset(runs), model.robot):
             tracks = model.tracks(w)
-            out[runs[tracks.run]] = path_errors(tracks)
+            out[runs[tracks.run]] = path_errors(tracks, w.parts)
     return out
 
 
@@ -318,14 +318,18 @@ PARTS = ((0.0, 1.0), (0.0, 0.5), (0.25, 0.75), (0.5, 1.0))
 """Beginnings and ends of the parts of a run that are judged, as fractions of its path length."""
 
 
-def path_errors(tracks: replay.Tracks) -> Float[np.ndarray, " run"]:
-    """Return the error of every track over its path length; see the module docstring."""
-    step = np.linalg.norm(np.diff(tracks.measured[..., :2], axis=1), axis=2)
+def path_errors(tracks: replay.Tracks, parts: int = 1) -> Float[np.ndarray, " run"]:
+    """Return the error of every track over its path length; see the module docstring.
+
+    `parts` is the number of steps from one measured pose to the next.
+    """
+    predicted, measured = (path[:, ::parts] for path in (tracks.predicted, tracks.measured))
+    step = np.linalg.norm(np.diff(measured[..., :2], axis=1), axis=2)
     far = np.concatenate([np.zeros((len(step), 1)), np.cumsum(step, axis=1)], axis=1)
     errors = []
     for begin, end in PARTS:
         i, j = (np.abs(far - part * far[:, -1:]).argmin(axis=1) for part in (begin, end))
-        moved = [_between(path, i, j) for path in (tracks.predicted, tracks.measured)]
+        moved = [_between(path, i, j) for path in (predicted, measured)]
         rows = np.arange(len(far))
         path = np.maximum(far[rows, j] - far[rows, i], 1e-9)
         errors.append(np.linalg.norm(moved[0] - moved[1], axis=1) / path)
