@@ -8,6 +8,7 @@ from importlib import import_module
 # type checkers treat this name as True; importing it from `typing` would load that module
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from slipid.api.calibration import calibrate as calibrate
     from slipid.api.camera import track as track
     from slipid.api.fit import Prior as Prior
     from slipid.api.fit import fit as fit
@@ -56,6 +57,7 @@ _ROOMS = {
     "Profile": "slipid.infer.verdicts.profile",
     "Robot": "slipid.model.robot",
     "Validation": "slipid.predict.validation",
+    "calibrate": "slipid.api.calibration",
     "check": "slipid.api.runs",
     "drive": "slipid.api.robot",
     "export": "slipid.api.robot",

@@ -12,7 +12,7 @@ from slipid.app.check import (
     ExpectedEstimate,
     ExpectedEstimates,
     calibration_part,
-    expected,
+    expected_if_any,
     overview,
 )
 from slipid.data.runs import Runs, collect
@@ -63,7 +63,7 @@ def check(
     content = overview(task)
     with Reporter(quiet=True) as report:
         started, part = calibration_part(task, content["findings"], report)
-    return LogCheck(content | part, expected(started, started.problem()))
+    return LogCheck(content | part, expected_if_any(started))
 
 
 @dataclass(frozen=True, eq=False)

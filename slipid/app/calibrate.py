@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +12,17 @@ from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask
 from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration.result import ABSURD, Calibration
-from slipid.infer.fit_file import IDENTIFIED, SCHEMA
+from slipid.infer.fit_file import FIT, IDENTIFIED, SCHEMA
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
-from slipid.predict.selection import FloorSelection, KinematicFit, kinematic_fit, selected
+from slipid.predict.selection import (
+    CONTRADICTION,
+    FloorSelection,
+    KinematicFit,
+    kinematic_fit,
+    selected,
+)
 from slipid.search_space import Space
+from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_json
 from slipid.support.progress import Reporter
 
@@ -35,8 +42,13 @@ class CalibrationResult:
     calibration: Calibration
     selection: dict[str, FloorSelection]
     trust: Trust
-    task: ConfigFitTask
-    written: tuple[str, ...]
+    task: FitTask
+    written: tuple[str, ...] = ()
+
+    @property
+    def models(self) -> dict[str, str]:
+        """Name of the selected model, keyed by floor."""
+        return {floor: one.model for floor, one in self.selection.items()}
 
 
 def calibrated(task: FitTask, report: Reporter) -> KinematicFit:
@@ -83,13 +95,13 @@ def remarks(
             "the calibration had not settled when it ended, so that its intervals may be too "
             "narrow: drive more runs, with turns and straight parts at several speeds"
         )
-    what = "base" if c.sideways else "track"
+    what = c.length
     far_base = _is_absurd(c.base[c.firmest].value / c.nominal_base)
     straight = [f for f, v in c.base.items() if v.verdict == "not_identified" and not far_base]
     if len(straight) == len(c.base):
         out.append(
             f"no run turns: the effective {what} and the place of the pose sensor are not "
-            "identified; drive curves or turns on the spot"
+            f"identified; drive {'curves' if c.steering else 'curves or turns on the spot'}"
         )
     elif straight:
         out.append(f"on {', '.join(straight)} no run turns: the effective {what} is not identified")
@@ -103,9 +115,10 @@ def remarks(
         if one.runs == 1:
             out.append(f"on {floor} one run alone: intervals come from its parts; drive several")
     out += _one_speed(task)
-    for name, value, nominal in (
-        ("wheel radius", _mean_radius(c), c.nominal_radius),
-        (what, c.base[c.firmest].value, c.nominal_base),
+    radii, base = c.radius[c.firmest], c.base[c.firmest]
+    for name, value, nominal, std in (
+        ("wheel radius", _mean_radius(c), c.nominal_radius, max(v.std for v in radii)),
+        (what, base.value, c.nominal_base, base.std),
     ):
         ratio = value / nominal
         if _is_absurd(ratio):
@@ -114,7 +127,7 @@ def remarks(
                 "to be trusted, unless the wheels really slip that much: check the lengths of "
                 "[robot], and the columns and units of wheels and poses"
             )
-        elif abs(ratio - 1) > FAR_FROM_CONFIG and (name != what or not straight):
+        elif abs(value - nominal) > max(FAR_FROM_CONFIG * nominal, CONTRADICTION * std):
             out.append(
                 f"the {name} in the config is {1e3 * nominal:.4g} mm; on {c.firmest} it is "
                 f"{1e3 * value:.4g} mm ({100 * (ratio - 1):+.1f} %)"
@@ -122,9 +135,14 @@ def remarks(
     apart = [abs(v.value / _mean_radius(c) - 1) for row in c.radius.values() for v in row]
     effects = [max(x[:2]) for x in c.noise.effect.values()]
     kinematic = all(one.model != "contact" for one in selection.values())
-    if kinematic and max(effects) < SLIP_SEEN and max(apart) < 2 * SLIP_SEEN:
-        out.append("no slip seen: effective lengths explain the motion")
-    elif kinematic and len(c.radius) == 1:
+    known = all(v.verdict in ("identified", "fixed") for v in (*radii, base))
+    repeated = known and all(one.held_out for one in selection.values())
+    if kinematic and repeated and max(effects) < SLIP_SEEN and max(apart) < 2 * SLIP_SEEN:
+        if c.centre:
+            out.append("runs do not differ in slip: effective lengths explain the motion")
+        else:
+            out.append("no slip seen: effective lengths explain the motion")
+    if kinematic and known and len(c.radius) == 1:
         out.append(
             "one floor alone: a constant slip looks the same as smaller wheels; a firm floor would "
             "tell them apart"
@@ -177,6 +195,14 @@ def _mean_radius(c: Calibration) -> float:
     return sum(v.value for v in radii) / len(radii)
 
 
+def calibration_of(task: FitTask, report: Reporter) -> CalibrationResult:
+    """Return the calibration of a task with the selected kinematic models and the trust in them."""
+    found = calibrated(task, report)
+    selection = selected(task.dataset, found.errors, found.contradicted)
+    trust = verdict_of_trust(selection, notes=remarks(found, selection, task))
+    return CalibrationResult(found.calibration, selection, trust, task)
+
+
 def calibrate_only(
     task: ConfigFitTask, data: Path, out: Path, report: Reporter
 ) -> CalibrationResult:
@@ -187,11 +213,17 @@ def calibrate_only(
         data: folder of the logs.
         out: folder to write to.
         report: reporter of the progress.
+
+    Raises:
+        DataError: the folder has the result of a whole fit.
     """
+    if (out / FIT).exists():
+        raise DataError(
+            f"{out}: has the result of a whole fit ({FIT}), which a calibration would contradict; "
+            "choose another folder with --out"
+        )
     began = time.monotonic()
-    found = calibrated(task, report)
-    selection = selected(task.dataset, found.errors, found.contradicted)
-    trust = verdict_of_trust(selection, notes=remarks(found, selection, task))
+    found = calibration_of(task, report)
     writable(out)
     runs = [log.name for log in task.logs]
     messages = [] if task.calibration_only is None else [task.calibration_only]
@@ -204,14 +236,13 @@ def calibrate_only(
         "validity": {},
         "messages": ["calibrated kinematics alone: no force balance was fitted", *messages],
         "calibration": found.calibration.to_json(),
-        "selected_model": {floor: one.model for floor, one in selection.items()},
-        "trust": trust.to_json(),
+        "selected_model": found.models,
+        "trust": found.trust.to_json(),
         "data": {"hash": task.data_hash, "runs": runs},
     }
     write_json(out / IDENTIFIED, content)
-    write_run(task, trust, data, out, time.monotonic() - began)
-    written = (IDENTIFIED, "run.json", "config.toml")
-    return CalibrationResult(found.calibration, selection, trust, task, written)
+    write_run(task, found.trust, data, out, time.monotonic() - began)
+    return replace(found, written=(IDENTIFIED, "run.json", "config.toml"))
 
 
 def write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:

@@ -190,12 +190,7 @@ def check(
     task, part = calibration_part(task, content["findings"], report)
     content |= part
     report.stage("expected information")
-    try:
-        estimates_before = expected(task, task.problem())
-    except DataError as error:  # the logs leave no windows to fit
-        message = f"no estimate of a fit can be predicted: {error}"
-        estimates_before = ExpectedEstimates({}, {}, (message,))
-    content |= estimates_before.to_json()
+    content |= expected_if_any(task).to_json()
     if out is not None:
         write_json(out / "check.json", content)
     return task.dataset, content
@@ -272,6 +267,14 @@ def _clock(clock: Clock) -> Content:
         "drift_std": clock.drift_std,
         "told_by": clock.source,
     }
+
+
+def expected_if_any(task: FitTask) -> ExpectedEstimates:
+    """Return the expected estimates of a fit to a task, or why there are none."""
+    try:
+        return expected(task, task.problem())
+    except DataError as error:  # the logs leave no windows to fit
+        return ExpectedEstimates({}, {}, (f"no estimate of a fit can be predicted: {error}",))
 
 
 def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:

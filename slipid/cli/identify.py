@@ -48,10 +48,14 @@ def identify(
     from slipid.support.files import read_json
 
     wanted = read_config(config)
-    if isinstance(wanted.content.robot, BenchMotors):
-        return bench(wanted, data, out, profile or (), json, quiet)
     if only not in (None, "calibration"):
         raise DataError(f"--only {only}: no such part; expected calibration")
+    if only and profile:
+        raise DataError("--profile needs the force balance: leave out --only calibration")
+    if isinstance(wanted.content.robot, BenchMotors):
+        if only:
+            raise DataError("--only calibration: a motor on a bench has no kinematics to calibrate")
+        return bench(wanted, data, out, profile or (), json, quiet)
     with Reporter(quiet=quiet) as report:
         task = checked_task(config, data, report, anyway)
         if reason := task.calibration_only:
@@ -81,8 +85,7 @@ def calibration(
     from slipid.deploy.deploy import ROBOT, calibrated_robot
 
     done = calibrate_only(task, data, out, report)
-    models = {floor: one.model for floor, one in done.selection.items()}
-    calibrated_robot(done.calibration, task.robot, models, task.dataset).save(out / ROBOT)
+    calibrated_robot(done.calibration, task.robot, done.models, task.dataset).save(out / ROBOT)
     return replace(done, written=(*done.written, ROBOT))
 
 

@@ -221,7 +221,10 @@ def _edges(
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
     if sentence := incomplete_poses(data, run):
-        raise DataError(sentence)
+        raise DataError(
+            f"{sentence}. Kinematics alone can be calibrated: slipid identify --only calibration, "
+            "or slipid.calibrate"
+        )
     shown = time[fresh] - lag
     fresh = fresh[(fresh >= first) & (shown >= time[0] - 1e-9) & (shown <= time[-1] + 1e-9)]
     if len(fresh) < per_segment + 1:
@@ -251,8 +254,7 @@ def incomplete_poses(data: Runs, run: int) -> str | None:
         return None
     return (
         f"{data.logs[run].name}: poses {what or f'in {len(pose)} rows only'}; expected x, y and "
-        "heading during the run, which a fit of motors and contact needs. Kinematics alone can be "
-        "calibrated: slipid identify --only calibration"
+        "heading during the run, which a fit of motors and contact needs"
     )
 
 

@@ -41,9 +41,9 @@ from slipid.search_space import Space
 LENGTHS = ("robot.wheel_radius", "robot.radius_deviation", "robot.base_radius")
 """Paths of the lengths of the robot that slip can imitate."""
 HELD_ROUNDS = 2
-"""Number of rounds from the start in which these lengths do not move."""
+"""Number of rounds of the staged start in which all parameters but these lengths move."""
 SAME_LENGTHS = 0.02
-"""Largest difference between lengths that are taken for the same, relative [1]."""
+"""Largest difference between lengths that are taken for the same, over the lengths [1]."""
 _MOST_REFUSED = 12
 """Largest number of steps that the solver may refuse in a round."""
 
@@ -79,10 +79,6 @@ def optimise(
 ) -> Optimum:
     """Return the maximum a posteriori, searched from `staged_start` or from a given state.
 
-    The lengths of the robot stay where they start in the first `HELD_ROUNDS` rounds. With outliers
-    and variances of the noise still unknown, lengths that move at once can end in an optimum where
-    they stand for slip.
-
     Args:
         keep: 1 for segments that are fitted, 0 for held-out ones, in the order of
             `Problem.full_weight`; all 1 by default. Folds of a cross-validation differ in this
@@ -98,16 +94,14 @@ def optimise(
     keep = problem.full_weight if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
     mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
-    lengths = _lengths(problem.space)
     history: list[float] = []
     while state.round < most_rounds:
-        early, held = state.round < 3, state.round < HELD_ROUNDS
+        early = state.round < 3
         scoring = (2 if early else 4) if variances else 0
-        may_move = mask * ~lengths if held else mask
-        state = one_round(problem, state, keep, may_move, steps=8 if early else 4, scoring=scoring)
+        state = one_round(problem, state, keep, mask, steps=8 if early else 4, scoring=scoring)
         history.append(state.loss)
         tell(state)
-        if state.moved < tolerance and not held:
+        if state.moved < tolerance:
             break
     covariance = problem.laplace(state.z, state.log_variance, keep)
     reason = f"{most_rounds} rounds without convergence"
@@ -202,7 +196,9 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
     which only the floors' parameters may move fits each floor independently. The start with the
     least loss is chosen floor by floor. Lengths may start from a calibration, which slip has made
     shorter; if they differ from the means of their priors, all is repeated from those means, and
-    the better of the two is chosen.
+    the better of the two is chosen. Last, all parameters but the lengths are fitted in a few
+    rounds: with outliers and variances of the noise still unknown, lengths that move at once can
+    end in an optimum where they stand for slip.
     """
     space = problem.space
     first, lengths = _motor_start(problem, keep), _lengths(space)
@@ -211,7 +207,11 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
         again = np.where(lengths, space.prior_mean, first)
         other, loss_of_other = _floors_fitted(problem, keep, tell, again, ", lengths of the config")
         found = other if loss_of_other < loss else found
-    return found
+    state = replace(found, stage="all but the lengths")
+    for _ in range(HELD_ROUNDS):
+        state = one_round(problem, state, keep, (~lengths).astype(float), steps=8, scoring=2)
+        tell(state)
+    return replace(state, round=0, moved=np.inf, stage="joint")
 
 
 def _floors_fitted(

@@ -86,11 +86,6 @@ class FloorSelection:
     held_out: bool
 
     @property
-    def best(self) -> str:
-        """Name of the model with the smallest error."""
-        return min(self.errors, key=lambda name: self.errors[name])
-
-    @property
     def sentence(self) -> str:
         """The selected model and its error on held-out runs, beside that of the config."""
         which = "held-out" if self.held_out else "fitted"

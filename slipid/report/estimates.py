@@ -88,6 +88,9 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     """Write the parameters of a fit, their profiles, its warnings and how it ended."""
     if fit.calibration is not None:
         show_calibration(page, fit.calibration)
+    by_contact = [name for name, floor in fit.selection.items() if floor.model == "contact"]
+    where = f"selected on {', '.join(by_contact)}" if by_contact else "selected on no floor"
+    page.line(f"force balance, {where}:")
     page.table(estimates(fit.parameters.values(), f"{len(fit.runs)} runs, {fit.rounds} rounds"))
     if fit.derived:
         page.table(estimates(fit.derived.values(), OPEN_RATIOS))
@@ -120,10 +123,7 @@ def calibration_table(found: Calibration) -> Table:
         made.add_row(Text(name), f"{factor * value.value:.5g}", unit, ends, verdict(value.verdict))
 
     for floor, radii in found.radius.items():
-        sides: Iterable[object]
-        sides = ("left", "right") if len(radii) == 2 else range(1, len(radii) + 1)
-        sides, radii = (("of all drives",), radii[:1]) if found.steering else (sides, radii)
-        for side, value in zip(sides, radii, strict=True):
+        for side, value in found.drives(radii).items():
             row(f"{floor}: rolling radius {side}", value)
         row(f"{floor}: effective {found.length}", found.base[floor])
         if floor in found.centre:
@@ -149,7 +149,11 @@ def show_trust(page: Page, found: "Trust") -> None:
         each = (percent(floor.errors[m]) for m in models)
         made.add_row(Text(name), *each, floor.model, str(floor.runs))
     if found.floors:
-        page.line("held-out runs, open loop from the first pose: error over the path length")
+        every = all(floor.held_out for floor in found.floors.values())
+        page.line(
+            f"errors of {'held-out' if every else 'held-out or single'} runs over their path "
+            "length, open loop, mean over the run and its halves"
+        )
         page.table(made)
     page.notes(found.notes)
     page.line(f"verdict: {found}")
@@ -197,11 +201,12 @@ def show_check(page: Page, found: Content) -> None:
     if "calibration" in found:
         show_calibration(page, Calibration.of_json(found["calibration"]))
     page.notes(found.get("suspects", ()))
-    page.line(
-        "before a fit: what a fit may find, from the least to the most informative of plausible "
-        "floors, motors and noise; only the fit itself can find at bound or disputed"
-    )
-    page.table(_expected(found["parameters"] | found["derived"]))
+    if found["parameters"]:
+        page.line(
+            "before a fit: what a fit may find, from the least to the most informative of "
+            "plausible floors, motors and noise; only the fit itself can find at bound or disputed"
+        )
+        page.table(_expected(found["parameters"] | found["derived"]))
     page.notes(found["messages"])
 
 

@@ -301,10 +301,10 @@ def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fi
     assert found.converged, found.reason
     std = np.sqrt(np.diag(best.covariance))
     np.testing.assert_allclose(found.state.z / std, best.state.z / std, atol=0.05)
-    joint = [s for s in told if s.stage == "joint"]
-    radii = [float(value(problem, s, "robot.wheel_radius")) for s in joint]
-    assert radii[0] == radii[1] == pytest.approx(0.04)
-    assert radii[2] != radii[1]
+    held = [s for s in told if s.stage == "all but the lengths"]
+    radii = [float(value(problem, s, "robot.wheel_radius")) for s in held]
+    assert radii == pytest.approx([0.04, 0.04])
+    assert float(value(problem, found.state, "robot.wheel_radius")) != radii[1]
 
 
 # what is compiled

@@ -446,20 +446,26 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         return bool(abs(total(names)) > np.log(ABSURD))
 
     def value(
-        names: Sequence[str], unit: str, log_of: float | None = None, far: bool = False
+        names: Sequence[str],
+        unit: str,
+        log_of: float | None = None,
+        far: bool = False,
+        mean_of: Sequence[str] = (),
     ) -> Value:
-        """Return the sum of some coordinates, or the exponential of the sum, times `log_of`."""
-        w = np.array([float(name in names) for name in model.free])
-        stds = {name: model.numbers[name].std for name in names if name in model.numbers}
+        """Return a sum of coordinates and the mean of others, or its exponential times `log_of`."""
+        part = dict.fromkeys(names, 1.0) | dict.fromkeys(mean_of, 1 / max(len(mean_of), 1))
+        w = np.array([part.get(name, 0.0) for name in model.free])
+        known = model.numbers
+        stds = {name: part[name] * known[name].std for name in part if name in known}
         prior = float(np.hypot.reduce([*stds.values()], initial=0.0))
         hidden = [std for name, std in stds.items() if name in model.unseen]
-        at = total(names)
+        at = sum(share * total([name]) for name, share in part.items())
         influence = (off @ w) ** 2
         jackknife = (count - 1) / count * float(influence.sum())
         std = float(np.sqrt(max(float(w @ covariance @ w), jackknife)))
         std = float(np.hypot.reduce([std, *hidden])) if w.any() else prior
-        share = influence / max(float(influence.sum()), 1e-300)
-        freedom = max(1 / max(float((share**2).sum()), 1e-9) - 1, 3.0)
+        of_all = influence / max(float(influence.sum()), 1e-300)
+        freedom = max(1 / max(float((of_all**2).sum()), 1e-9) - 1, 3.0)
         half = std * float(student.ppf(0.95, freedom))
         verdict: Verdict = "fixed" if prior == 0 else "identified"
         if prior > 0 and std > IDENTIFIED * prior:
@@ -484,6 +490,9 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         "gain": value(["gain"], "1"),
         "understeer": value(["understeer"], "s^2/m"),
     }
+    # The sensor's yaw is that of all sessions: one of them alone would leave the common part open.
+    yaws = {f"yaw@{s}": float(model.column(f"yaw@{s}", z)) for s in model.sessions}
+    mean_yaw = float(np.mean(list(yaws.values())))
     return Calibration(
         sideways=shape.determines_twist,
         radius={
@@ -495,8 +504,10 @@ def _result(fit: _Fit, rough: bool = False) -> Calibration:
         base={f: value(base_names(f), "m", base, far_base) for f in model.floors},
         centre={f: value([f"centre.{f}"], "m") for f in model.floors if has_centre(shape)},
         offset=(value(["offset.x"], "m"), value(["offset.y"], "m")),
-        yaw=value(["yaw"], "rad"),
-        session_yaw={s: float(model.column(f"yaw@{s}", z)) for s in model.sessions},
+        yaw=value(["yaw"], "rad", mean_of=list(yaws)),
+        session_yaw={
+            s: yaw - mean_yaw for s, yaw in zip(model.sessions, yaws.values(), strict=True)
+        },
         lag=value(["lag"], "s"),
         scale=value(["scale"], "1"),
         firmest=firm,

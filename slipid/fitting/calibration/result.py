@@ -3,7 +3,7 @@
 Module `estimate` estimates them from runs with poses.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -74,8 +74,8 @@ class Calibration:
         centre: centre of rotation ahead of the axle's middle, keyed by floor [m]; empty for wheels
             that have none.
         offset: place of the pose sensor ahead of and to the left of the robot's middle [m].
-        yaw: heading of the pose sensor less that of the robot [rad].
-        session_yaw: deviation of the sensor's heading in each session [rad].
+        yaw: heading of the pose sensor less that of the robot, mean over sessions [rad].
+        session_yaw: deviation of the sensor's yaw from this mean in each session [rad].
         lag: lag of the poses behind the wheels [s].
         scale: true over logged length [1].
         firmest: floor with the largest radius, to which the centre and other radii refer.
@@ -114,11 +114,7 @@ class Calibration:
         """One line for each floor, and one for the pose sensor, for people."""
         lines = []
         for floor, radii in self.radius.items():
-            names = (
-                ["left", "right"] if len(radii) == 2 else [str(j + 1) for j in range(len(radii))]
-            )
-            names, radii = (["mean"], radii[:1]) if self.steering else (names, radii)
-            each = ", ".join(f"{n} {_mm(v)}" for n, v in zip(names, radii, strict=True))
+            each = ", ".join(f"{n} {_mm(v)}" for n, v in self.drives(radii).items())
             ratio = self.multipliers[floor][1]
             line = f"{floor}: wheel radius {each}; effective {self.length} {_mm(self.base[floor])}"
             line += f", {ratio:.3f} of nominal"
@@ -128,11 +124,24 @@ class Calibration:
         if self.steering:
             lines.append(self._of_steering())
         x, y = self.offset
+        turned = _shown(self.yaw, f"{np.degrees(self.yaw.value):.2f} deg")
+        late = _shown(self.lag, f"{1e3 * self.lag.value:.0f} ms")
         lines.append(
-            f"pose sensor {_mm(x)} ahead and {_mm(y)} left of the middle, turned by "
-            f"{np.degrees(self.yaw.value):.2f} deg; poses are {1e3 * self.lag.value:.0f} ms late"
+            f"pose sensor {_mm(x)} ahead and {_mm(y)} left of the middle, turned by {turned}; "
+            f"poses are late by {late}"
         )
         return tuple(lines)
+
+    def drives(self, of_drives: Sequence[Value]) -> dict[str, Value]:
+        """Return numbers of the drives on a floor by their names; one for all of a steered robot.
+
+        Radii of the drives of a robot that steers are equal.
+        """
+        if self.steering:
+            return {"of all drives": of_drives[0]}
+        two = len(of_drives) == 2
+        names = ("left", "right") if two else [str(j + 1) for j in range(len(of_drives))]
+        return dict(zip(names, of_drives, strict=True))
 
     @property
     def length(self) -> str:
@@ -279,8 +288,13 @@ class Calibration:
 
 def _mm(length: Value) -> str:
     """Return a length in mm with half the width of its interval, or the reason why it has none."""
-    half = 0.5 * (length.interval90[1] - length.interval90[0])
+    half = 500 * (length.interval90[1] - length.interval90[0])
     text = f"{1e3 * length.value:.4g} mm"
-    if length.verdict == "not_identified":
-        return f"{text} (not identified)"
-    return text if length.verdict == "fixed" else f"{text} +- {1e3 * half:.2g}"
+    if length.verdict in ("not_identified", "fixed"):
+        return _shown(length, text)
+    return f"{text} +- {half:.0f}" if half >= 10 else f"{text} +- {half:.2g}"
+
+
+def _shown(value: Value, text: str) -> str:
+    """Return the text of a value, with a remark if the runs do not determine it."""
+    return f"{text} (not identified)" if value.verdict == "not_identified" else text

@@ -1,8 +1,9 @@
 """Trust in what was identified on each floor, from predictions of held-out runs.
 
 A fit is trusted if the model that was selected on each floor predicts held-out runs no worse than
-any simpler model, the lengths of the config included, and has physically plausible parameters. The
-force balance must also have converged, if it was selected on some floor.
+any simpler model, the lengths of the config included, but for a tenth and .1 % of the path, and has
+physically plausible parameters. The force balance must also have converged, if it was selected on
+some floor.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -23,7 +24,7 @@ WORSE_RATIO, WORSE_ERROR = 1.1, 0.001
 """The selected model is worse than a simpler one if its error exceeds that of the simpler one by
 more than this factor, and by more than this error over the path length [1]."""
 USELESS_ERROR = 0.5
-"""Error over the path length above which a model is useless."""
+"""Error over the path length above which a model is useless [1]."""
 MANY_AT_BOUNDS = 3
 """Smallest number of parameters at their bounds for which a fit is not to be trusted."""
 PLAUSIBLE: Mapping[str, tuple[float, float]] = {
@@ -135,8 +136,9 @@ def _of_errors(floors: Mapping[str, FloorSelection]) -> Iterator[_Reason]:
                 )
         if own > USELESS_ERROR:
             yield (
-                1,
-                f"on {name} no model predicts runs to {100 * USELESS_ERROR:.0f} % of the path",
+                2,
+                f"on {name} {floor.model} is off by {100 * own:.0f} % of the path, which is "
+                "useless: check the columns and units of wheels and poses",
             )
         if not floor.held_out:
             yield (

@@ -53,8 +53,8 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
             {"ice": floor(model="calibrated", nominal=0.9, calibrated=0.6)},
             True,
             [],
-            "doubtful",
-            "no model predicts runs to 50 %",
+            "not to be trusted",
+            "which is useless",
         ),
         ({"a": floor(contact=float("nan"))}, True, [number()], "not to be trusted", "not finite"),
         (
