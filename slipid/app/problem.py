@@ -314,7 +314,9 @@ def fit_task(
         hint = "; say which wheels share a motor by robot.drives = [[1, 3], [2, 4]]"
         hint = hint if shape.wheels == 2 * logged.wheels else ""
         if shape.driven is not None:
-            hint = f"; robot.encoders is the number on the {shape.driven} axle"
+            plural = "" if shape.wheels == 1 else "s"
+            drives = f"{shape.wheels} encoder{plural} on the {shape.driven} axle"
+            hint = f": set robot.encoders = {logged.wheels}, or give columns for {shape.wheels}"
         raise DataError(
             f"{config.path}: robot: {drives}, but {logged.name} has {logged.wheels}; expected the "
             f"same{hint}"

@@ -29,9 +29,9 @@ def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
     Dots are the measured slips of all wheels.
     """
     floors = list(dict.fromkeys(floor for floor, _ in measured.groups))
-    title = (
-        "Slip increases with the torque of a wheel, and further if the wheel also rolls sideways"
-    )
+    title = "Slip increases with the torque of a wheel"
+    if rolls := not all(fit.robot.geometry.grips):
+        title += ", and further if the wheel also rolls sideways"
     made, axes = drawing.panels(len(floors), 3.7, 3.9, title)
     drawn = None
     for ax, floor in zip(axes, floors, strict=True):
@@ -39,13 +39,15 @@ def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
         (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
         _curve(ax, fit, floor)
         ax.set(xlim=(min(0.0, left), right), ylim=(min(0.0, bottom), top))
-        ax.set_title(floor)
+        of_floor = fit.selection.get(floor)
+        unused = of_floor is not None and of_floor.model != "contact"
+        ax.set_title(f"{floor}: force balance, not selected" if unused else floor)
         torque = "predicted" if measured.amps is None else "from current"
         ax.set(xlabel=f"wheel torque {torque}, at even load [N m]", ylabel="slip of the wheel [1]")
     made.legend(
         *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False
     )
-    if drawn is not None:
+    if drawn is not None and rolls:
         bar = made.colorbar(drawn, ax=axes, pad=0.01, aspect=40, extend="max")
         bar.set_label("dots: sideways over rim speed [1]")
     return made
@@ -99,10 +101,10 @@ def _curve(ax: Axes, fit: Fit, floor: str) -> None:
     curve = fit.curves[floor]
     speed, share = curve.wheel_speed, curve.load_share
     slip = np.linspace(0.0, 1.0, 201)
-    for sideways, colour, label in (
-        (1.0, SIDEWAYS_COLOUR, "predicted: sideways as fast as ahead"),
-        (0.0, drawing.ORANGE, "predicted: rolls straight, 90 % band"),
-    ):
+    shown = [(0.0, drawing.ORANGE, "predicted: rolls straight, 90 % band")]
+    if not all(fit.robot.geometry.grips):
+        shown.insert(0, (1.0, SIDEWAYS_COLOUR, "predicted: sideways as fast as ahead"))
+    for sideways, colour, label in shown:
         torque = wheel_curve(fit.robot, floor, slip, sideways, speed, share)
         within = torque <= curve.torque_nm[-1]
         ax.plot(torque, slip, "--", color=colour, lw=1.2)
