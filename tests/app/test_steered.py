@@ -91,7 +91,11 @@ def test_a_slow_steering_angle_is_linear_between_its_readings(car, tmp_path):
     ("old", "new", "says"),
     [
         (STEERING, "", "no steering angle; expected the channel steering_angle"),
-        ("encoders = 2", "encoders = 1", "1 encoder on the rear axle, but .* has 2; expected the same: set robot.encoders = 2"),
+        (
+            "encoders = 2",
+            "encoders = 1",
+            "1 encoder on the rear axle, but .* has 2; expected the same: set robot.encoders = 2",
+        ),
         ("encoders = 2", "encoders = 3", "encoders"),
         ("encoders = 2", "drives = [[1, 2]]", "drives is given; expected encoders"),
         (
