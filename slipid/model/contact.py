@@ -1,8 +1,9 @@
 """Contact equilibrium: the twist at which wheel traction, roller drag and scrub balance.
 
-The forces are those of `slipid.model.contact_law`. The root of their balance is found by a fixed
-number of chord steps, which approach it from any start, followed by damped Newton steps with the
-analytic 3x3 Jacobian; its derivative follows from the implicit function theorem.
+The forces are those of `slipid.model.contact_law`. The root of their balance is found by chord
+steps, which approach it from any start, followed by damped Newton steps with the analytic 3x3
+Jacobian; its derivative follows from the implicit function theorem. Where wheels hardly creep,
+chord steps approach the root slowly and Newton steps may end beside it: both are then repeated.
 """
 
 from functools import partial
@@ -18,9 +19,11 @@ from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, solve3
 
 _CHORD_STEPS = 30
-"""Number of chord steps of `root`."""
+"""Number of chord steps of `root` in an attempt."""
 _NEWTON_STEPS = 8
-"""Number of damped Newton steps of `root`, after the chord steps."""
+"""Number of damped Newton steps of `root` in an attempt, after the chord steps."""
+_BALANCED, _MOST_ATTEMPTS = 1e-16, 20
+"""Squared residual force at which `root` ends [(mu m g)^2], and its largest number of attempts."""
 _DAMPING = (1.0, 0.3, 0.05)
 """Factors of Newton's step that are tried in each damped step."""
 _ROUNDING = 1e-20
@@ -94,9 +97,16 @@ def root(problem: ContactProblem) -> Float[Array, "3"]:
     def newton(xi: Array, _: None) -> tuple[Array, None]:
         return jnp.stack(_damped(balance, Planar(*xi))), None
 
+    def attempt(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        near = jax.lax.scan(chord, state[0], None, length=_CHORD_STEPS)[0]
+        return jax.lax.scan(newton, near, None, length=_NEWTON_STEPS)[0], state[1] + 1
+
+    def goes_on(state: tuple[Array, Array]) -> Array:
+        size = balance.size(balance.force(Planar(*state[0])))
+        return (size > _BALANCED) & (state[1] < _MOST_ATTEMPTS)
+
     start = _start(problem.rim, problem.frame)
-    near = jax.lax.scan(chord, start, None, length=_CHORD_STEPS)[0]
-    return jax.lax.scan(newton, near, None, length=_NEWTON_STEPS)[0]
+    return jax.lax.while_loop(goes_on, attempt, (start, jnp.zeros((), int)))[0]
 
 
 @jax.jit
