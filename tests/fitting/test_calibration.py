@@ -246,3 +246,21 @@ def test_small_steering_angles_do_not_tell_gain_from_wheelbase(tmp_path, angles)
     if angles:
         assert zero.interval90[1] - zero.interval90[0] < 2e-3
         assert gain.value / wheelbase.value == pytest.approx(0.9 / 0.256, rel=0.02)
+
+
+def test_errors_that_are_alike_within_a_run_widen_the_intervals(task_of):
+    """Runs whose wheels roll 2 % farther or less far than others know the radius to a hundredth."""
+    task = task_of(MADE["diff_umbmark"])
+    shares = 0.02 * np.array([1.0, -1.3, 0.4, 1.2, -0.9, -0.4])
+    logs = zip(task.dataset.logs, shares, strict=True)
+    data = collect([replace(log, wheel_angle=log.wheel_angle / (1 + s)) for log, s in logs])
+    found = calibrate(data, Space(task.robot, task.choices), task.choices)
+    along, across, _ = found.noise.effect["floor"]
+    assert along == pytest.approx(0.02, rel=0.5)
+    assert across < 0.5 * along
+    for radius, truth in zip(
+        found.radius["floor"], MADE["diff_umbmark"].floors[0].radius, strict=True
+    ):
+        low, high = radius.interval90
+        assert low < truth < high
+        assert 0.01 < (high - low) / truth < 0.06
