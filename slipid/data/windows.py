@@ -280,7 +280,7 @@ def _cut(
     t, angle = data.time[rows], data.turned(run)
     part = np.arange(parts * (len(edges) - 1) + 1) / parts
     logged = np.column_stack([t, data.pose[rows]])[edges]
-    shown, *pose = interpolate(np.arange(len(edges)), logged, part).T
+    shown, *pose = interpolate(np.arange(1.0 * len(edges)), logged, part).T
     at = shown - lag
     half = SPEED_S / 2
     turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))

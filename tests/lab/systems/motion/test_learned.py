@@ -157,10 +157,10 @@ def test_a_neural_network_learns_how_slip_turns_with_the_direction():
             for of_run, run in zip(predicted, new, strict=True)
         ]
     )
-    # Slip moves the end point by 0.20 m on average. A single direction may be off by a tenth of
-    # that, depending on the seed and the processor; the mean over directions hardly varies.
-    assert np.hypot(errors[:, 0], errors[:, 1]).mean() < 0.012
-    assert errors[:, 2].mean() < 0.015
+    # Slip moves the ends by 0.20 m and turns them by 0.41 rad on average; nine tenths are learnt.
+    # The mean over directions is judged: that of one varies with the library and the processor.
+    assert np.hypot(errors[:, 0], errors[:, 1]).mean() < 0.02
+    assert errors[:, 2].mean() < 0.04
 
 
 def test_the_numbers_of_a_network_are_its_weights():
