@@ -60,7 +60,7 @@ def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
     The number of steps of a run is a power of two, so that few array shapes are compiled. A step
     has one twist. Where wheels change their speeds within steps, the run's steps are divided.
     """
-    steps = []
+    steps, spec = [], RobotSpec.of(robot)
     for k, log in enumerate(data.logs):
         want = 2 ** int(np.ceil(np.log2(max(log.duration / LONGEST_STEP_S, 16))))
         frames = int(data.fresh[data.rows(k)].sum())
@@ -68,13 +68,13 @@ def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
             want //= 2
         steps.append(want)
     return whole_runs(
-        data, robot, steps, [parts_of_steps(data, k, robot, n) for k, n in enumerate(steps)]
+        data, robot, steps, [parts_of_steps(data, k, spec, n) for k, n in enumerate(steps)]
     )
 
 
-def parts_of_steps(data: Runs, run: int, robot: Robot, steps: int) -> int:
+def parts_of_steps(data: Runs, run: int, spec: RobotSpec, steps: int) -> int:
     """Return the number of parts of each step in which a run's wheels are nearly steady."""
-    rows, spec = data.rows(run), RobotSpec.of(robot)
+    rows = data.rows(run)
     time, angle = data.time[rows], data.turned(run)
 
     def path(parts: int) -> Float[np.ndarray, "edge 3"]:

@@ -5,9 +5,13 @@ import json
 import numpy as np
 import pytest
 
+import slipid as sl
+from slipid.app.config import read_config
+from slipid.app.problem import read_fit_task
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.robot.interface import Measurement
+from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import write
 from tests.benchmarks.every_robot.rivals import read
 from tests.benchmarks.every_robot.robots import ROBOTS
@@ -70,6 +74,46 @@ def test_another_part_than_the_calibration_is_refused(calibrated):
     )
     assert done.exit_code == 2
     assert "--only slip: no such part; expected calibration" in done.stderr
+
+
+def test_a_whole_fit_is_not_overwritten_by_a_calibration(calibrated, tmp_path):
+    """Files of two results in one folder would contradict each other."""
+    folder = calibrated[0]
+    (tmp_path / "fit.json").write_text("{}", encoding="utf-8")
+    words = ("identify", folder / "robot.toml", "--data", folder / "logs", "--out", tmp_path)
+    done = invoke(*words, "--only", "calibration", "--quiet")
+    assert done.exit_code == 2
+    assert "has the result of a whole fit (fit.json)" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["fit.json"]
+
+
+def test_a_profile_needs_the_force_balance(calibrated, tmp_path):
+    folder = calibrated[0]
+    words = ("identify", folder / "robot.toml", "--data", folder / "logs", "--out", tmp_path)
+    done = invoke(*words, "--only", "calibration", "--profile", "motor.resistance", "--quiet")
+    assert done.exit_code == 2
+    assert "--profile needs the force balance" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_python_gives_the_numbers_of_the_command_line(calibrated):
+    """Also `print`, and the robot of an estimator."""
+    folder, out, *_ = calibrated
+    with Reporter(quiet=True) as report:
+        task = read_fit_task(read_config(folder / "robot.toml"), folder / "logs", report)
+    found = sl.calibrate(task.dataset, task.robot, quiet=True)
+    section = json.loads((out / "identified.json").read_text())["calibration"]
+    for mine, other in zip(
+        found.calibration.radius["floor"],
+        section["surfaces"]["floor"]["rolling_radius_m"],
+        strict=True,
+    ):
+        assert mine.value == pytest.approx(other["value"], rel=1e-4)
+    assert found.trust.word == "trusted"
+    assert "floor: rolling radius left" in str(found)
+    assert "verdict: trusted" in str(found)
+    kept = DeployedRobot.load(out / "robot.json")
+    np.testing.assert_allclose(found.deploy().kinematics, kept.kinematics, rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["diff_positions", "diff_heading"])
