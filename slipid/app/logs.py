@@ -187,10 +187,8 @@ def _files(root: Path, glob: str, where: str) -> list[Path]:
     """Return the files that match a glob; `where` names the place of the glob in errors."""
     try:
         return find_logs(root, glob)
-    except (
-        ValueError,
-        NotImplementedError,
-    ) as error:  # pathlib raises the latter for absolute globs
+    # pathlib raises `NotImplementedError` for absolute globs
+    except (ValueError, NotImplementedError) as error:
         raise DataError(f"{where} '{glob}': {error}") from error
 
 

@@ -223,7 +223,7 @@ def _floors_fitted(
 ) -> tuple[FitState, float]:
     """Return a start vector with each floor fitted, and its loss but for a factor and an offset.
 
-    `first` is the vector before, and `remark` is told with the stage.
+    `first` is the vector before; `remark` is appended to the name of the stage.
     """
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)

@@ -160,17 +160,19 @@ def test_without_a_turn_the_order_of_two_wheels_is_not_judged():
 
 
 def test_a_wrong_radius_alone_is_calibrated():
-    calibration, said = judged(MIXED, 1.5)
+    calibration, remarked = judged(MIXED, 1.5)
     assert calibration.radius["floor"][0].value == pytest.approx(0.05, rel=5e-3)
     assert calibration.radius["floor"][0].verdict == "identified"
-    assert "the wheel radius in the config is 75 mm; on floor it is 49.98 mm" in said
+    assert "the wheel radius in the config is 75 mm; on floor it is 49.98 mm" in remarked
 
 
 def test_lengths_far_from_the_config_do_not_count_as_identified():
-    calibration, said = judged(MIXED, 4.0)
+    calibration, remarked = judged(MIXED, 4.0)
     assert {v.verdict for v in calibration.radius["floor"]} == {"not_identified"}
-    assert re.search("the wheel radius comes out 0.2[0-9]* times as large as in the config", said)
-    assert "the wheel radius in the config is" not in said
+    assert re.search(
+        "the wheel radius comes out 0.2[0-9]* times as large as in the config", remarked
+    )
+    assert "the wheel radius in the config is" not in remarked
 
 
 @pytest.mark.slow
@@ -180,23 +182,25 @@ def test_one_run_is_said_to_be_one():
 
 
 def test_without_turns_the_track_is_not_identified():
-    calibration, said = judged(STRAIGHT)
+    calibration, remarked = judged(STRAIGHT)
     assert calibration.base["floor"].verdict == "not_identified"
     assert calibration.base["floor"].value == pytest.approx(STRAIGHT.nominal_base)
-    assert "no run turns: the effective track and the place of the pose sensor" in said
+    assert "no run turns: the effective track and the place of the pose sensor" in remarked
     assert "no run turns" not in judged(MIXED)[1]
 
 
 def test_one_speed_is_said_with_what_it_does_not_tell():
-    said = judged(SQUARES)[1]
-    assert "one speed alone on floor (0.2 m/s): the runs do not show whether slip grows" in said
-    assert "nearly one number" not in said
+    remarked = judged(SQUARES)[1]
+    assert "one speed alone on floor (0.2 m/s): the runs do not show whether slip grows" in remarked
+    assert "nearly one number" not in remarked
     assert "one speed" not in judged(MIXED)[1]
 
 
 def test_one_speed_without_headings_mixes_lag_and_place():
-    said = judged(replace(SQUARES, pose_kind="xy"))[1]
-    assert "the lag of the poses and the place of their sensor ahead are nearly one number" in said
+    remarked = judged(replace(SQUARES, pose_kind="xy"))[1]
+    assert (
+        "the lag of the poses and the place of their sensor ahead are nearly one number" in remarked
+    )
 
 
 def test_check_does_not_calibrate_exchanged_wheels():
@@ -218,11 +222,11 @@ def test_identify_refuses_wheels_that_never_turn(tmp_path):
 def test_wheels_that_slip_far_on_one_of_two_floors_are_identified_there():
     hard, soft = (replace(MIXED.floors[0], name=name) for name in ("hard", "soft"))
     soft = replace(soft, radius=tuple(0.25 * r for r in soft.radius))
-    calibration, said = judged(replace(MIXED, floors=(hard, soft)))
+    calibration, remarked = judged(replace(MIXED, floors=(hard, soft)))
     assert calibration.firmest == "hard"
     assert {v.verdict for row in calibration.radius.values() for v in row} == {"identified"}
     assert calibration.radius["soft"][0].value == pytest.approx(0.25 * 0.05, rel=0.02)
-    assert "is not to be trusted" not in said
+    assert "is not to be trusted" not in remarked
 
 
 def test_a_calibration_that_still_changes_when_it_ends_is_reported(monkeypatch):

@@ -296,12 +296,12 @@ def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fi
     start = Choice("robot.wheel_radius", start=radius, prior_mean=0.04, prior_std=0.004)
     problem = Problem(surface_problem.windows, surface_problem.robot, [*SURFACE[:-1], start])
     assert value(problem, begin(problem), "robot.wheel_radius") == pytest.approx(radius)
-    told = []
-    found = optimise(problem, tolerance=2e-4, most_rounds=100, tell=told.append)
+    states = []
+    found = optimise(problem, tolerance=2e-4, most_rounds=100, tell=states.append)
     assert found.converged, found.reason
     std = np.sqrt(np.diag(best.covariance))
     np.testing.assert_allclose(found.state.z / std, best.state.z / std, atol=0.05)
-    held = [s for s in told if s.stage == "all but the lengths"]
+    held = [s for s in states if s.stage == "all but the lengths"]
     radii = [float(value(problem, s, "robot.wheel_radius")) for s in held]
     assert radii == pytest.approx([0.04, 0.04])
     assert float(value(problem, found.state, "robot.wheel_radius")) != radii[1]

@@ -16,7 +16,7 @@ Every fit begins with these numbers (see `slipid.model.kinematics` for the equat
 They minimise the squared whitened innovations of all poses (module `innovations`), each run
 weighted by a Student t, plus a Gaussian prior. The variances of poses and motion are estimated by
 maximum likelihood in turn. Intervals are from a jackknife over runs, since the kinematics are wrong
-somewhere and errors of a run are alike; they are at least as wide as those of the likelihood.
+somewhere and errors within a run are correlated; they are at least as wide as the likelihood's.
 
 Straight driving determines the steering's zero, and turns determine gain over wheelbase. Gain and
 wheelbase apart follow from large angles alone, by the tangent, so that both have priors: the

@@ -146,7 +146,7 @@ OMNI3, OMNI4 = (60.0, 180.0, 300.0), (45.0, 135.0, 225.0, 315.0)
 MOTORS = Motors(0.9, 0.045, 12.0, 0.06, 0.012, 0.02)
 
 
-def alike(
+def equal_wheels(
     name: str,
     radius: float,
     drives: int,
@@ -161,7 +161,12 @@ def alike(
 
 ROBOTS = (
     MadeRobot(
-        "diff_right", "differential", (alike("floor", 0.05, 2, 0.30),), 0.05, 0.30, ticks=4096
+        "diff_right",
+        "differential",
+        (equal_wheels("floor", 0.05, 2, 0.30),),
+        0.05,
+        0.30,
+        ticks=4096,
     ),
     MadeRobot(
         "diff_umbmark",  # unequal wheels and a wrong track, squares both ways
@@ -176,7 +181,7 @@ ROBOTS = (
     MadeRobot(
         "diff_only_changes",
         "differential",
-        (alike("carpet", 0.0523, 2, 0.605),),
+        (equal_wheels("carpet", 0.0523, 2, 0.605),),
         0.0508,
         0.56,
         only_changes=True,
@@ -189,7 +194,7 @@ ROBOTS = (
     MadeRobot(
         "diff_positions",  # a satellite antenna: no heading
         "differential",
-        (alike("yard", 0.102, 2, 0.42),),
+        (equal_wheels("yard", 0.102, 2, 0.42),),
         0.10,
         0.40,
         place=(0.15, 0.0),
@@ -202,7 +207,7 @@ ROBOTS = (
     MadeRobot(
         "diff_wrong_label",  # one run on tile lies in the folder of carpet
         "differential",
-        (alike("carpet", 0.0485, 2, 0.310), alike("tile", 0.050, 2, 0.302)),
+        (equal_wheels("carpet", 0.0485, 2, 0.310), equal_wheels("tile", 0.050, 2, 0.302)),
         0.05,
         0.30,
         ticks=2048,
@@ -211,7 +216,7 @@ ROBOTS = (
     MadeRobot(
         "diff_motors",
         "differential",
-        (alike("floor", 0.0762, 2, 0.36),),
+        (equal_wheels("floor", 0.0762, 2, 0.36),),
         0.0762,
         0.35,
         ticks=8192,
@@ -221,7 +226,7 @@ ROBOTS = (
     MadeRobot(
         "diff_own",
         "differential",
-        (alike("carpet", 0.0757, 2, 0.448), alike("tile", 0.0770, 2, 0.448)),
+        (equal_wheels("carpet", 0.0757, 2, 0.448), equal_wheels("tile", 0.0770, 2, 0.448)),
         0.0762,
         0.46,
         place=(0.060, 0.010),
@@ -235,7 +240,7 @@ ROBOTS = (
     MadeRobot(
         "diff_coarse_ticks",  # least squares finds a lag of 0.4 rows here, and there is none
         "differential",
-        (alike("floor", 0.0335, 2, 0.152),),
+        (equal_wheels("floor", 0.0335, 2, 0.152),),
         0.0325,
         0.16,
         ticks=40,
@@ -245,7 +250,7 @@ ROBOTS = (
     MadeRobot(
         "diff_low_rate",
         "differential",
-        (alike("floor", 0.0765, 2, 0.34),),
+        (equal_wheels("floor", 0.0765, 2, 0.34),),
         0.075,
         0.33,
         rate=5.0,
@@ -256,7 +261,7 @@ ROBOTS = (
     MadeRobot(
         "diff_large_lag",
         "differential",
-        (alike("floor", 0.098, 2, 0.39),),
+        (equal_wheels("floor", 0.098, 2, 0.39),),
         0.10,
         0.40,
         lag=0.6,
@@ -287,8 +292,8 @@ ROBOTS = (
         "skid_two_floors",
         "skid",
         (
-            alike("asphalt", 0.165, 2, 0.825, centre=-0.03),
-            alike("grass", 0.158, 2, 0.99, centre=-0.09),
+            equal_wheels("asphalt", 0.165, 2, 0.825, centre=-0.03),
+            equal_wheels("grass", 0.158, 2, 0.99, centre=-0.09),
         ),
         0.165,
         0.55,
@@ -303,7 +308,7 @@ ROBOTS = (
     MadeRobot(
         "skid_lidar",
         "skid",
-        (alike("gravel", 0.152, 2, 0.86, centre=-0.05),),
+        (equal_wheels("gravel", 0.152, 2, 0.86, centre=-0.05),),
         0.15,
         0.60,
         half_length=0.25,
@@ -321,7 +326,7 @@ ROBOTS = (
     MadeRobot(
         "skid_load_slip",
         "skid",
-        (alike("grass", 0.16, 2, 0.5, grip=Grip((0.22, 0.22, 0.28, 0.28), 0.1, 1.0)),),
+        (equal_wheels("grass", 0.16, 2, 0.5, grip=Grip((0.22, 0.22, 0.28, 0.28), 0.1, 1.0)),),
         0.16,
         0.50,
         half_length=0.2,
@@ -333,7 +338,7 @@ ROBOTS = (
     MadeRobot(
         "omni3_right",
         "omni",
-        (alike("table", 0.04, 3, 0.125),),
+        (equal_wheels("table", 0.04, 3, 0.125),),
         0.04,
         0.125,
         azimuths_deg=OMNI3,
@@ -353,7 +358,7 @@ ROBOTS = (
     MadeRobot(
         "omni3_two_floors",  # a constant slip of 8 % on the soft floor
         "omni",
-        (alike("hard", 0.04, 3, 0.125), alike("soft", 0.0368, 3, 0.127)),
+        (equal_wheels("hard", 0.04, 3, 0.125), equal_wheels("soft", 0.0368, 3, 0.127)),
         0.04,
         0.125,
         azimuths_deg=OMNI3,
@@ -362,7 +367,7 @@ ROBOTS = (
     MadeRobot(
         "omni3_marker",
         "omni",
-        (alike("floor", 0.0403, 3, 0.131),),
+        (equal_wheels("floor", 0.0403, 3, 0.131),),
         0.04,
         0.125,
         azimuths_deg=OMNI3,
@@ -374,8 +379,8 @@ ROBOTS = (
         "omni3_load_slip",
         "omni",
         (
-            alike("gray", 0.04, 3, 0.125, grip=Grip((0.26, 0.40, 0.34), 0.3, 0.3)),
-            alike("green", 0.04, 3, 0.125, grip=Grip((0.26, 0.40, 0.34), 0.7, 0.4)),
+            equal_wheels("gray", 0.04, 3, 0.125, grip=Grip((0.26, 0.40, 0.34), 0.3, 0.3)),
+            equal_wheels("green", 0.04, 3, 0.125, grip=Grip((0.26, 0.40, 0.34), 0.7, 0.4)),
         ),
         0.04,
         0.125,
@@ -385,7 +390,7 @@ ROBOTS = (
     MadeRobot(
         "omni4_wrong_base",
         "omni",
-        (alike("floor", 0.0492, 4, 0.212),),
+        (equal_wheels("floor", 0.0492, 4, 0.212),),
         0.05,
         0.20,
         azimuths_deg=OMNI4,
@@ -395,7 +400,7 @@ ROBOTS = (
     MadeRobot(
         "omni4_load_slip",
         "omni",
-        (alike("felt", 0.05, 4, 0.20, grip=Grip((0.18, 0.32, 0.29, 0.21), 0.6, 0.3)),),
+        (equal_wheels("felt", 0.05, 4, 0.20, grip=Grip((0.18, 0.32, 0.29, 0.21), 0.6, 0.3)),),
         0.05,
         0.20,
         azimuths_deg=OMNI4,
@@ -403,7 +408,7 @@ ROBOTS = (
     MadeRobot(
         "mecanum_wrong_base",
         "mecanum",
-        (alike("floor", 0.0675, 4, 0.36),),
+        (equal_wheels("floor", 0.0675, 4, 0.36),),
         0.07,
         0.385,
         half_length=0.2,
@@ -414,7 +419,7 @@ ROBOTS = (
     MadeRobot(
         "mecanum_two_floors",
         "mecanum",
-        (alike("tile", 0.0502, 4, 0.31), alike("rug", 0.0478, 4, 0.325)),
+        (equal_wheels("tile", 0.0502, 4, 0.31), equal_wheels("rug", 0.0478, 4, 0.325)),
         0.05,
         0.30,
         half_length=0.16,
@@ -424,7 +429,7 @@ ROBOTS = (
     MadeRobot(
         "mecanum_load_slip",
         "mecanum",
-        (alike("rug", 0.05, 4, 0.30, grip=Grip((0.22, 0.23, 0.27, 0.28), 0.25)),),
+        (equal_wheels("rug", 0.05, 4, 0.30, grip=Grip((0.22, 0.23, 0.27, 0.28), 0.25)),),
         0.05,
         0.30,
         half_length=0.16,
@@ -432,7 +437,7 @@ ROBOTS = (
     MadeRobot(
         "tricycle_front",  # the steered front wheel drives
         "steered",
-        (alike("hall", 0.122, 1, 1.05),),
+        (equal_wheels("hall", 0.122, 1, 1.05),),
         0.125,
         1.0,
         driven="front",
@@ -447,7 +452,7 @@ ROBOTS = (
     MadeRobot(
         "bicycle_zero",  # zero offset and gain of the steering
         "steered",
-        (alike("floor", 0.033, 1, 0.256),),
+        (equal_wheels("floor", 0.033, 1, 0.256),),
         0.0325,
         0.256,
         steering_zero=-0.035,
@@ -459,7 +464,7 @@ ROBOTS = (
     MadeRobot(
         "ackermann_car",  # two rear wheels with an encoder each
         "steered",
-        (alike("asphalt", 0.0318, 2, 0.33),),
+        (equal_wheels("asphalt", 0.0318, 2, 0.33),),
         0.0325,
         0.324,
         steering_zero=0.015,
@@ -472,7 +477,7 @@ ROBOTS = (
     MadeRobot(
         "ackermann_understeer",
         "steered",
-        (alike("asphalt", 0.0525, 2, 0.33, understeer=0.03),),
+        (equal_wheels("asphalt", 0.0525, 2, 0.33, understeer=0.03),),
         0.05,
         0.33,
         steering_zero=0.01,
@@ -485,7 +490,7 @@ ROBOTS = (
     MadeRobot(
         "ackermann_two_floors",
         "steered",
-        (alike("asphalt", 0.051, 2, 0.40), alike("gravel", 0.0495, 2, 0.43)),
+        (equal_wheels("asphalt", 0.051, 2, 0.40), equal_wheels("gravel", 0.0495, 2, 0.43)),
         0.05,
         0.40,
         steering_zero=0.02,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -24,6 +25,10 @@ FORMATS = {
     "esc_report": "uint64_t timestamp;int32_t esc_rpm;float esc_current;uint8_t[4] _padding0;",
     "esc_status": "uint64_t timestamp;esc_report[2] esc;uint8_t count;uint8_t[7] _padding0;",
 }
+needs_pyulog = pytest.mark.skipif(
+    find_spec("pyulog") is None,
+    reason="ULog files need slipid[ulog], which the development environment has",
+)
 TIME = 7_000_000 + 20_000 * np.arange(100)  # us
 TURN = 0.01 * np.arange(100)
 
@@ -51,10 +56,8 @@ def log(tmp_path):
     return write_ulog(tmp_path / "run.ulg", FORMATS, messages)
 
 
+@needs_pyulog
 def test_topics_come_back(log):
-    pytest.importorskip(
-        "pyulog", reason="ULog files need slipid[ulog], which the development environment has"
-    )
     topics = {
         "wheel_angle": {"topic": "wheel_encoders"},
         "wheel_speed": {"topic": "wheel_encoders"},
@@ -78,19 +81,15 @@ def test_topics_come_back(log):
     assert any("z points down" in note for note in run.notes)
 
 
+@needs_pyulog
 def test_a_pose_may_have_a_quaternion_that_begins_with_w(log):
-    pytest.importorskip(
-        "pyulog", reason="ULog files need slipid[ulog], which the development environment has"
-    )
     run = read(log, topics={"pose": {"topic": "vehicle_visual_odometry"}})
     np.testing.assert_allclose(run.signals["pose_heading"].values[:, 0], -TURN, atol=1e-6)
     np.testing.assert_allclose(run.signals["pose_y"].values[:, 0], -2 * TURN, atol=1e-6)
 
 
+@needs_pyulog
 def test_topics_are_described_and_proposed(log):
-    pytest.importorskip(
-        "pyulog", reason="ULog files need slipid[ulog], which the development environment has"
-    )
     found = {topic.name: topic for topic in topics_of(log)}
     assert found["wheel_encoders"].serves == ("wheel_angle", "wheel_speed")
     assert found["vehicle_local_position"].serves == ("pose",)
@@ -103,10 +102,8 @@ def test_topics_are_described_and_proposed(log):
     assert '"differential"' in config.text
 
 
+@needs_pyulog
 def test_a_damaged_log_is_named(log):
-    pytest.importorskip(
-        "pyulog", reason="ULog files need slipid[ulog], which the development environment has"
-    )
     log.write_bytes(log.read_bytes()[:12])
     with pytest.raises(DataError, match=r"run\.ulg: the bag is damaged.*from the robot again"):
         topics_of(log)
