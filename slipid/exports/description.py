@@ -17,8 +17,9 @@ import numpy as np
 
 from slipid.exports.text import filled, interval, listed, one_line, short, table, wrapped
 from slipid.parameter import entries
-from slipid.robot.controller import Gains, Limits
+from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.limits import Limits
 from slipid.robot.record import Pair, Provenance, Source, Verdict
 from slipid.robot.robot_file import declared_numbers
 
@@ -103,12 +104,13 @@ def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
 
 
 LIMITS: Mapping[str, tuple[str, str]] = {
+    "speed": ("m/s", "largest translational speed demanded of the body"),
+    "yaw_rate": ("rad/s", "largest yaw rate demanded of the body"),
+    "acceleration": ("m/s^2", "largest acceleration of the rim of a wheel"),
     "wheel_speed": ("rad/s", "largest speed of a wheel"),
-    "acceleration": ("rad/s^2", "largest acceleration of a wheel"),
     "voltage": ("V", "supply voltage"),
-    "twist": ("m/s", "largest translational speed demanded of the body"),
 }
-"""Unit and meaning of every field of `slipid.robot.controller.Limits`."""
+"""Unit and meaning of every field of `slipid.robot.limits.Limits`."""
 
 
 def gains_origin(robot: DeployedRobot) -> str:
@@ -248,7 +250,7 @@ def table_files(robot: DeployedRobot) -> dict[str, str]:
 
 def _table_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     yield from _gain_rows(robot)
-    for name, value in asdict(Limits()).items():
+    for name, value in asdict(Limits.of(robot)).items():
         unit, about = LIMITS[name]
         sure = ("by hand", "default of slipid")
         yield NumberRow("limits", f"limits.{name}", "", "", float(value), unit, None, *sure, about)

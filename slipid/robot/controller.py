@@ -32,7 +32,8 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.parameter import as_numbers, parameter
 from slipid.robot.deployed import RobotArrays, with_record
-from slipid.robot.interface import UNTIMED_S, Scalar, StateEstimate, as_arrays
+from slipid.robot.interface import UNTIMED_S, StateEstimate, as_arrays
+from slipid.robot.limits import Limits
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
 Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
@@ -89,22 +90,6 @@ class Gains(eqx.Module):
         if not (tuned.is_better or forced):
             return cls()
         return cls(*(as_numbers(getattr(tuned.values, f.name).value) for f in fields(cls)))
-
-
-class Limits(eqx.Module):
-    """Limits of a command.
-
-    Attributes:
-        wheel_speed: largest speed of a wheel [rad/s].
-        acceleration: largest acceleration of a wheel [rad/s^2].
-        voltage: voltage of the supply [V].
-        twist: largest translational speed that is demanded of the body [m/s].
-    """
-
-    wheel_speed: Scalar = 13.0
-    acceleration: Scalar = 25.0
-    voltage: Scalar = 22.0
-    twist: Scalar = 0.5
 
 
 class ControllerState(eqx.Module):
@@ -169,7 +154,7 @@ def limit_command(
     over = jnp.max(jnp.abs(wanted) / most)
     wanted = wanted / jnp.maximum(over, 1.0)
     step = wanted - before
-    allowed = limits.acceleration * jnp.minimum(dt, 0.5)
+    allowed = limits.acceleration / robot.frame.radius * jnp.minimum(dt, 0.5)
     size = jnp.max(jnp.abs(step))
     out = before + step * jnp.where(size > allowed, allowed / jnp.maximum(size, 1e-9), 1.0)
     return jnp.clip(out, -limits.wheel_speed, limits.wheel_speed)
@@ -299,7 +284,7 @@ class Controller(eqx.Module):
         """
         wanted = self._pose_loop(old, ref, pose, gap) if self.law is None else self.law(ref, pose)
         wanted = wanted * _recovery_factors(old.tried)
-        fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.twist
+        fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.speed
         return wanted.at[:2].divide(jnp.maximum(fast, 1.0))
 
     def _pose_loop(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:

@@ -31,12 +31,12 @@ from slipid.robot.controller import (
     RECOVERY_LIMIT_S,
     RECOVERY_TURN_S,
     STUCK_S,
-    Limits,
 )
 from slipid.robot.estimator import SLIP_CURRENT
 from slipid.robot.filter import hypotheses
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.interface import UNTIMED_S, Settings
+from slipid.robot.limits import Limits
 from tests.benchmarks.export_builds import (
     FAST,
     HERE,
@@ -125,9 +125,9 @@ def numbers() -> str:
         "INTEGRAL": k.integral,
         "OBSERVER": k.observer,
         "SPEED_LIMIT": most.wheel_speed,
-        "ACCELERATION_LIMIT": most.acceleration,
+        "ACCELERATION_LIMIT": most.acceleration / f.frame.radius,
         "VOLTAGE_LIMIT": most.voltage,
-        "TWIST_LIMIT": most.twist,
+        "TWIST_LIMIT": most.speed,
         "LONGEST_I": LARGEST_INTEGRAL,
         "OBSERVE": OBSERVER_S,
         "STUCK": STUCK_S,

@@ -15,8 +15,9 @@ from slipid.exports.description import header
 from slipid.exports.ros.folder import ros2_files
 from slipid.exports.ros.yaml_text import scalar
 from slipid.exports.text import identifiers
-from slipid.robot.controller import Gains, Limits
+from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.limits import Limits
 from tests.helpers.exported import LOADS, ODD, mecanum_robot
 from tests.helpers.ros_yaml import flat, parameters, read
 
@@ -161,7 +162,7 @@ def test_defaults_are_the_values_and_all_is_described(node, declared):
         ("floors", ["a", "a", "b", "c"], "unique<>"),
         ("wheels.grips", [0, 0, 0], "no bool_array"),
         ("errors.wet_sand.process", [0.0, -1.0, 0.0], "lower_element_bounds<>"),
-        ("limits.twist", 0.0, "gt<>"),
+        ("limits.speed", 0.0, "gt<>"),
     ],
 )
 def test_wrong_parameters_are_refused_by_the_declaration(node, declared, name, value, fault):

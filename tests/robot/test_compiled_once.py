@@ -11,10 +11,11 @@ import pytest
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.robot.closed_loop import ControlLoop, run_closed_loop
-from slipid.robot.controller import Controller, Gains, Limits
+from slipid.robot.controller import Controller, Gains
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.interface import Measurement, Settings
+from slipid.robot.limits import Limits
 from slipid.robot.trajectory import waypoints
 from slipid.robot.twin import Twin, TwinPlant
 from tests.helpers import small_twin
@@ -149,7 +150,7 @@ def test_another_robot_other_gains_and_limits_are_controlled_without_compiling(r
         after = [
             step(Controller(two)),
             step(Controller(one, gains)),
-            step(Controller(one, Gains(), Limits(2.0, 3.0, 4.0, 0.1))),
+            step(Controller(one, Gains(), Limits(0.1, 2.0, 0.12, 2.0, 4.0))),
         ]
     assert found == []
     assert not any(np.allclose(before, other) for other in after)
@@ -166,7 +167,7 @@ def test_another_robot_runs_a_closed_loop_without_compiling(robots):
 
     before = course(one, ONE, Limits())
     with compilations() as found:
-        after = [course(two, ONE, Limits()), course(one, OTHER, Limits(6.0, 10.0, 20.0, 0.15))]
+        after = [course(two, ONE, Limits()), course(one, OTHER, Limits(0.15, 2.0, 0.4, 6.0, 20.0))]
     assert found == []
     assert not any(np.allclose(before[:9], other[:9]) for other in after)
 

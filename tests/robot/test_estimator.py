@@ -18,13 +18,14 @@ from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.controller import LARGEST_INTEGRAL, Controller, Gains, Limits, limit_command
+from slipid.robot.controller import LARGEST_INTEGRAL, Controller, Gains, limit_command
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.filter.pose_fix import _within
 from slipid.robot.interface import UNTIMED_S, Measurement, Readings, Settings
+from slipid.robot.limits import Limits
 from slipid.robot.trajectory import rectangle
 from slipid.robot.twin import Twin, TwinPlant
 from tests.helpers import small_twin
@@ -34,6 +35,8 @@ from tests.helpers.stepped import stepped
 
 PATH = rectangle()
 LIMITS = Limits()
+WHEEL_ACCELERATION = LIMITS.acceleration / 0.04
+"""Limit of wheel acceleration of wheels with a radius of 40 mm [rad/s^2]."""
 DT = 0.05
 KINDS = ("contact", "curve")
 CHESS = Floor.of("abc", np.add.outer(np.arange(9), np.arange(9)) % 3, (-1.0, -1.0), 0.25, "abc")
@@ -96,7 +99,7 @@ def sane(kind, state, said, before, dt):
     passed = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
     stops = jnp.all(jnp.abs(command) <= jnp.abs(last.command))
     passed = jnp.where(stops, jnp.maximum(passed, UNTIMED_S), passed)
-    allowed = LIMITS.acceleration * passed + 1e-9
+    allowed = WHEEL_ACCELERATION * passed + 1e-9
     slow = jnp.all(jnp.abs(command) <= LIMITS.wheel_speed + 1e-9)
     gentle = jnp.all(jnp.abs(command - last.command) <= allowed) | ~last.begun
     left = jnp.maximum(LIMITS.voltage - f.motor.resistance * jnp.abs(amps), 0.2 * LIMITS.voltage)
@@ -209,10 +212,10 @@ def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
         rows.append(command)
     rows, quiet = np.array(rows), 60 + int(0.3 / DT) + 1
     assert np.abs(rows[55]).max() > 2.0, "it drives before"
-    assert np.abs(np.diff(rows, axis=0)).max() <= LIMITS.acceleration * DT + 1e-9
-    brake = int(np.ceil(LIMITS.wheel_speed / LIMITS.acceleration / DT)) + 1
+    assert np.abs(np.diff(rows, axis=0)).max() <= WHEEL_ACCELERATION * DT + 1e-9
+    brake = int(np.ceil(LIMITS.wheel_speed / WHEEL_ACCELERATION / DT)) + 1
     np.testing.assert_array_equal(rows[quiet + brake : 100], 0.0)
-    assert np.abs(rows[100] - rows[99]).max() <= LIMITS.acceleration * DT + 1e-9
+    assert np.abs(rows[100] - rows[99]).max() <= WHEEL_ACCELERATION * DT + 1e-9
     assert np.abs(rows[120:]).max() > 1.0, "it drives again"
     assert float(said.time) > 0
 
@@ -220,7 +223,7 @@ def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
 def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
     state, speed = control_loop("contact").init(), np.array([4.0, -3.0, 2.0])
     state, said = step("contact")(state, reading(wheel_speed=speed), DT)
-    assert np.abs(np.asarray(said.command) - speed).max() <= LIMITS.acceleration * DT + 1e-9
+    assert np.abs(np.asarray(said.command) - speed).max() <= WHEEL_ACCELERATION * DT + 1e-9
 
 
 @pytest.mark.slow

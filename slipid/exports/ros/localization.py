@@ -32,8 +32,8 @@ from slipid.exports.ros.yaml_text import Parameter
 from slipid.exports.text import short
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.robot.controller import Limits
 from slipid.robot.deployed import DeployedRobot, RobotArrays
+from slipid.robot.limits import Limits
 from slipid.robot.record import Axes, axes_of
 
 DISTANCE_M = 1.0
@@ -196,8 +196,7 @@ def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
     for velocities it is (a T)^2 per period T [s], where a is the largest acceleration
     [m/s^2, rad/s^2].
     """
-    acceleration = float(Limits().acceleration)
-    change = acceleration * float(robot.frame.radius)
+    change = float(Limits.of(robot).acceleration)
     speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S
     noise = dict(zip(("x", "y", "yaw"), errors.walk(top_speed(robot), DISTANCE_M), strict=True))
     noise |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
@@ -206,7 +205,7 @@ def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
         f"On '{errors.floor}'. Pose: a random walk that replaces the errors that stay constant "
         f"over a path, with the same error after {short(DISTANCE_M)} m at the highest speed of "
         f"the fitted runs, {short(top_speed(robot))} m/s. Velocity: the change that the limit of "
-        f"wheel acceleration, {short(acceleration)} rad/s^2, allows within {short(PERIOD_S)} s. "
+        f"acceleration, {short(change)} m/s^2, allows within {short(PERIOD_S)} s. "
         "Accelerations: the default of robot_localization. All other states are held at zero by "
         "two_d_mode."
     )

@@ -15,8 +15,9 @@ from slipid.exports.description import LIMITS, gains_origin, verdict_text
 from slipid.exports.ros.yaml_text import Check, Parameter
 from slipid.exports.text import identifiers, interval, listed
 from slipid.parameter import Entry, entries
-from slipid.robot.controller import Gains, Limits
+from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.limits import Limits
 from slipid.robot.record import RecordedNumber
 from slipid.robot.robot_file import declared_numbers
 
@@ -125,7 +126,7 @@ def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
         if e.path == "place":
             about = f"{about}. {gains_origin(robot)}"
         yield Parameter(f"gains.{e.path}", float(e.get(gains)), about, (), read_only=False)
-    for name, value in asdict(Limits()).items():
+    for name, value in asdict(Limits.of(robot)).items():
         unit, about = LIMITS[name]
         check = (Check("gt<>", (0.0,)),)
         yield Parameter(f"limits.{name}", float(value), f"{about} [{unit}]", check, read_only=False)

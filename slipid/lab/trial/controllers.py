@@ -18,8 +18,9 @@ from slipid.lab.trial.published_laws import (
     inverse_kinematics,
 )
 from slipid.robot.closed_loop import PERIOD
-from slipid.robot.controller import Gains, Law, Limits
+from slipid.robot.controller import Gains, Law
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.limits import Limits
 from slipid.robot.trajectory import ROW_PERIOD, rectangle
 from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
