@@ -8,10 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.controller import Controller, Correction, Gains, Law
+from slipid.robot.controller import Controller, Correction, Law
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
+from slipid.robot.gains import Gains
 from slipid.robot.interface import AbstractEstimator, Settings
 from slipid.support.errors import DataError
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from slipid.exports.text import filled, interval, listed, one_line, short, table, wrapped
 from slipid.parameter import entries
-from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.gains import Gains
 from slipid.robot.limits import Limits
 from slipid.robot.record import Pair, Provenance, Source, Verdict
 from slipid.robot.robot_file import declared_numbers

@@ -22,7 +22,6 @@ docs/results.md.
 """
 
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Literal
 
 import equinox as eqx
@@ -30,8 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from slipid.parameter import as_numbers, parameter
-from slipid.robot.deployed import RobotArrays, with_record
+from slipid.robot.deployed import RobotArrays
+from slipid.robot.gains import Gains
 from slipid.robot.interface import UNTIMED_S, StateEstimate, as_arrays
 from slipid.robot.limits import Limits
 
@@ -57,39 +56,6 @@ RECOVERY_GROWTH = 0.6
 """Relative growth of the demanded twist per second of recovery [1/s]."""
 RECOVERY_LIMIT_S = 15.0
 """Duration of a recovery after which the robot stops for good [s]."""
-
-
-class Gains(eqx.Module):
-    """Gains of a controller; the defaults were set by hand."""
-
-    place: Array = parameter("1/s", "k", "pose loop", start=1.5)
-    yaw: Array = parameter("1/s", "k_yaw", "heading loop", start=1.5)
-    integral: Array = parameter("1/s^2", "k_i", "pose error's integral", start=0.0)
-    observer: Array = parameter("1", "k_d", "disturbance observer", start=0.0)
-    preview: Array = parameter(
-        "s",
-        "t_p",
-        "time by which reference rates are read ahead on the path, to compensate the wheels' delay",
-        start=0.2,
-    )
-
-    @classmethod
-    def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
-        """Return a robot's tuned gains, or the gains set by hand.
-
-        Tuned gains are returned if they are better than the gains set by hand, or if `forced` is
-        True. Without tuned gains for the robot's load set-up, the gains set by hand are returned.
-
-        Raises:
-            ValueError: the robot consists of arrays without a record.
-        """
-        known = with_record(robot)
-        tuned = known.record.gains
-        if tuned is None or tuned.load != known.load_setup:
-            return cls()
-        if not (tuned.is_better or forced):
-            return cls()
-        return cls(*(as_numbers(getattr(tuned.values, f.name).value) for f in fields(cls)))
 
 
 class ControllerState(eqx.Module):

@@ -212,7 +212,7 @@ class GainRecord:
 
 @dataclass(frozen=True)
 class GainValues:
-    """All gains of `slipid.robot.controller.Gains`, and the gain `ahead`, which is no longer used.
+    """All gains of `slipid.robot.gains.Gains`, and the gain `ahead`, which is no longer used.
 
     Attributes:
         place: gain of the position loop.

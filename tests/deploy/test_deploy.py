@@ -14,8 +14,8 @@ from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
 from slipid.deploy.robot_record import DIRECTIONS
 from slipid.fitting.shared_effects import SpeedAndLoad, TravelConditions
 from slipid.infer.fit_file import load
-from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.gains import Gains
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_json

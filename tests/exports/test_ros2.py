@@ -15,8 +15,8 @@ from slipid.exports.description import header
 from slipid.exports.ros.folder import ros2_files
 from slipid.exports.ros.yaml_text import scalar
 from slipid.exports.text import identifiers
-from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.gains import Gains
 from slipid.robot.limits import Limits
 from tests.helpers.exported import LOADS, ODD, mecanum_robot
 from tests.helpers.ros_yaml import flat, parameters, read

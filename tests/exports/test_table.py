@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from slipid.exports.description import HEAD, table_files
-from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.gains import Gains
 from slipid.robot.limits import Limits
 from slipid.robot.robot_file import declared_numbers
 from tests.helpers.exported import LOADS, doubtful, mecanum_robot

@@ -11,9 +11,10 @@ import pytest
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.robot.closed_loop import ControlLoop, run_closed_loop
-from slipid.robot.controller import Controller, Gains
+from slipid.robot.controller import Controller
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
+from slipid.robot.gains import Gains
 from slipid.robot.interface import Measurement, Settings
 from slipid.robot.limits import Limits
 from slipid.robot.trajectory import waypoints

@@ -18,12 +18,13 @@ from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.controller import LARGEST_INTEGRAL, Controller, Gains, limit_command
+from slipid.robot.controller import LARGEST_INTEGRAL, Controller, limit_command
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.filter.pose_fix import _within
+from slipid.robot.gains import Gains
 from slipid.robot.interface import UNTIMED_S, Measurement, Readings, Settings
 from slipid.robot.limits import Limits
 from slipid.robot.trajectory import rectangle

@@ -12,7 +12,7 @@ import pytest
 
 from slipid.robot import trajectory
 from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.controller import Controller, Gains
+from slipid.robot.controller import Controller
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.floor import MAP_ERROR, SPREAD
 from slipid.robot.filter.floor_filter import FloorFilter, TimeStep, _followed
@@ -20,6 +20,7 @@ from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.filter.pose_filter import PoseFilter
 from slipid.robot.filter.pose_fix import apply_map
 from slipid.robot.filter.wheels import MotorCurrents
+from slipid.robot.gains import Gains
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, Measurement, Settings
 from slipid.robot.twin import ActuatorModel, Twin
 from tests.helpers.rolled_out import rollout

@@ -22,8 +22,8 @@ from slipid.deploy.robot_record import robot_record
 from slipid.model.geometry import omni
 from slipid.model.robot import Validity, build
 from slipid.parameter import entries
-from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot, posterior_robots
+from slipid.robot.gains import Gains
 from slipid.robot.record import EffectRecord, GainValues
 from slipid.support.errors import DataError
 from slipid.support.files import checksum

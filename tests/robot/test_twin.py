@@ -7,8 +7,9 @@ import pytest
 
 from slipid.model import contact
 from slipid.robot.closed_loop import ControlLoop, Plant, run_closed_loop
-from slipid.robot.controller import Controller, Gains
+from slipid.robot.controller import Controller
 from slipid.robot.estimator import Odometry
+from slipid.robot.gains import Gains
 from slipid.robot.trajectory import waypoints
 from slipid.robot.twin import KEPT_COMMANDS, ActuatorModel, Twin, TwinPlant
 from tests.helpers.rolled_out import rollout

@@ -15,8 +15,8 @@ from slipid.exports.description import LIMITS, gains_origin, verdict_text
 from slipid.exports.ros.yaml_text import Check, Parameter
 from slipid.exports.text import identifiers, interval, listed
 from slipid.parameter import Entry, entries
-from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.gains import Gains
 from slipid.robot.limits import Limits
 from slipid.robot.record import RecordedNumber
 from slipid.robot.robot_file import declared_numbers

@@ -35,8 +35,8 @@ from slipid.lab.testsite.surfaces import SURFACES
 from slipid.lab.trial.controllers import ROWS, applicable, check_gains, unused_gains
 from slipid.lab.trial.summary import TrialRun, best_controllers, summaries
 from slipid.robot import closed_loop, trajectory
-from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot, posterior_robots
+from slipid.robot.gains import Gains
 from slipid.robot.interface import Measurement, Settings
 from slipid.robot.robot_file import typed
 from slipid.robot.twin import ActuatorModel

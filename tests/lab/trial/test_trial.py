@@ -24,12 +24,13 @@ from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot import trajectory as reference
 from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.controller import Controller, Gains
+from slipid.robot.controller import Controller
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
+from slipid.robot.gains import Gains
 from slipid.robot.interface import Measurement, Settings
 from slipid.robot.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.robot.robot_file import typed
