@@ -127,7 +127,7 @@ def test_the_robot_survives_its_file(driven, tmp_path):
 
 def test_it_has_no_controller(driven, tmp_path):
     robot, _ = driven
-    assert not robot.steers
+    assert robot.has_controller
     robot.save(tmp_path / "robot.json")
     with pytest.raises(DataError, match=r"the robot has an estimator .* but no controller"):
         read_robot(tmp_path)
