@@ -290,11 +290,11 @@ class Controller(eqx.Module):
         On an unknown floor the wheels are assumed to roll without slip.
         """
         f = self.robot
-        under = f.on_average(
-            jnp.where(jnp.isfinite(e.surface_probability.T), e.surface_probability.T, 0.0)
-        )
+        under = f.on_average(e.surface_probability[:, :-1].T)
         rolling = f.forward @ twist / f.frame.radius
-        return jnp.sum(under * jnp.vstack([f.inverse_kinematics @ twist, rolling]), axis=0)
+        slipping = jnp.sum(under * (f.inverse_kinematics @ twist), axis=0)
+        wheels = slipping + (1 - jnp.sum(under, axis=0)) * rolling
+        return jnp.where(jnp.isfinite(wheels), wheels, 0.0)
 
     def _limited_twist(self, wanted: Array) -> Float[Array, "3"]:
         """Return a twist within the limits of speed and yaw rate.
