@@ -37,6 +37,7 @@ from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
 from tests.helpers.floors import surface_at
 from tests.helpers.known_robot import deploy_known
+from tests.helpers.unicycle import Unicycle
 
 
 @pytest.fixture(scope="module")
@@ -162,32 +163,6 @@ def test_way_points_are_refused_with_the_reason():
         reference.circle(speed=0.0)
 
 
-class Perfect:
-    """A plant without slip, whose wheels turn as they are told, some periods later."""
-
-    def __init__(self, robot, start, travelled=1.0, late=0):
-        self.robot, self._pose, self.travelled = robot, np.array(start, float), travelled
-        self.angle = np.zeros(3)
-        self.waiting = [np.zeros(3)] * late
-
-    @property
-    def pose(self):
-        return tuple(float(v) for v in self._pose)
-
-    def reset(self):
-        return self.step(np.zeros(3))
-
-    def step(self, wheel_speed):
-        self.waiting = [*self.waiting, np.asarray(wheel_speed)]
-        wheel_speed = self.waiting.pop(0)
-        self.angle = self.angle + np.asarray(wheel_speed) * closed_loop.PERIOD
-        v = np.asarray(self.robot.inverse) @ np.asarray(wheel_speed) * 0.04 * closed_loop.PERIOD
-        v = v * [self.travelled, self.travelled, 1.0]
-        c, s = np.cos(self._pose[2]), np.sin(self._pose[2])
-        self._pose += [c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]]
-        return Measurement(wheel_angle=self.angle, current=np.full(3, 0.5))
-
-
 def control_loop(deployed, preview=0.0):
     gains = replace(Gains(), preview=jnp.asarray(preview))
     return ControlLoop(Odometry(deployed), Controller(deployed, gains))
@@ -199,7 +174,7 @@ def test_encoders_close_every_path_without_slip(deployed, name):
     start = (0.2, 0.1, -1.0)
     path = reference.PATHS[name](0.2).moved(start)
     course = closed_loop.run_closed_loop(
-        control_loop(deployed, 0.05), path, Perfect(deployed, start), start
+        control_loop(deployed, 0.05), path, Unicycle(deployed, start), start
     )
     found = closed_loop.path_metrics(course)
     assert found.finished
@@ -213,7 +188,7 @@ def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
     course = closed_loop.run_closed_loop(
-        control_loop(deployed), path, Perfect(deployed, start), start
+        control_loop(deployed), path, Unicycle(deployed, start), start
     )
     found = closed_loop.path_metrics(course)
     assert found.finished
@@ -231,7 +206,7 @@ def test_rates_are_commanded_early_for_wheels_with_a_lag(deployed):
     start, path = (0.0, 0.0, 0.0), reference.waypoints([(0.0, 0.0), (0.9, 0.0)])
     far = []
     for preview in (0.0, 0.2):
-        plant = Perfect(deployed, start, late=4)
+        plant = Unicycle(deployed, start, delay_s=0.2)
         far.append(
             closed_loop.run_closed_loop(control_loop(deployed, preview), path, plant, start)
             .pose[:, 0]
@@ -246,7 +221,7 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.rectangle()
     course = closed_loop.run_closed_loop(
-        control_loop(deployed), path, Perfect(deployed, start, 0.8), start
+        control_loop(deployed), path, Unicycle(deployed, start, radius=0.8, track=0.8), start
     )
     found = closed_loop.path_metrics(course)
     assert found.along_track_mm[0] == pytest.approx(-180, abs=12)
@@ -260,7 +235,7 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.circle(0.35)
     course = closed_loop.run_closed_loop(
-        control_loop(deployed), path, Perfect(deployed, start, 0.8), start
+        control_loop(deployed), path, Unicycle(deployed, start, radius=0.8, track=0.8), start
     )
     found = closed_loop.path_metrics(course)
     assert found.sides_mm[0] == pytest.approx(350 * np.sqrt(2), rel=0.01)
@@ -271,7 +246,7 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
 @pytest.mark.slow
 def test_a_robot_that_does_not_move_has_its_whole_path_left(deployed):
     path = reference.rectangle()
-    plant = Perfect(deployed, (0.0, 0.0, 0.0), 0.0)
+    plant = Unicycle(deployed, radius=0.0)
     course = closed_loop.run_closed_loop(control_loop(deployed), path, plant, (0.0, 0.0, 0.0))
     assert closed_loop.path_metrics(course).closure_mm < 5  # its encoders say that it has arrived
     course = replace(course, path_time=np.zeros_like(course.path_time))
@@ -362,7 +337,7 @@ def test_published_laws_close_the_rectangle_without_slip(deployed, row):
     path = reference.rectangle().moved(start)
     control_loop = control_loop_of(deployed, ROWS[row], Settings())
     found = closed_loop.path_metrics(
-        closed_loop.run_closed_loop(control_loop, path, Perfect(deployed, start), start)
+        closed_loop.run_closed_loop(control_loop, path, Unicycle(deployed, start), start)
     )
     assert found.finished
     assert found.closure_mm < 5
