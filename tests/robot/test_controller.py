@@ -150,5 +150,5 @@ def test_a_robot_that_cannot_go_sideways_reaches_its_reference(truth):
 
 def test_a_robot_that_steers_has_no_controller(robot):
     steering = Steering(*jnp.zeros((5, len(robot.labels))))
-    with pytest.raises(ValueError, match="steered wheels.* expected omni, mecanum, differential"):
+    with pytest.raises(ValueError, match=r"steered wheels.* expected omni, mecanum, differential"):
         Controller(replace(robot, steering=steering), Gains())
