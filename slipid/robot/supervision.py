@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from slipid.robot.interface import StateEstimate
+from slipid.robot.interface import Scalar, StateEstimate
 
 STUCK_S = 0.5
 """Time without the demanded motion after which a robot counts as stuck, and time with the demanded
@@ -103,7 +103,7 @@ def supervised(
     dt: Float[Array, ""],
     *,
     recovery: Bool[Array, ""],
-    highest_speed: Float[Array, ""],
+    highest_speed: Scalar,
     probe: Float[Array, ""],
     response: Float[Array, ""],
 ) -> ControllerState:
