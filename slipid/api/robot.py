@@ -6,7 +6,7 @@ from pathlib import Path
 
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.deploy.controllers import control_loop_of
-from slipid.deploy.deploy import NO_CONTROLLER, actuator_model_of
+from slipid.deploy.deploy import actuator_model_of
 from slipid.deploy.export import FORMS, Exported, ExportOptions
 from slipid.deploy.export import export as run
 from slipid.deploy.floors import floor_of
@@ -20,6 +20,7 @@ from slipid.deploy.twin_run import (
 )
 from slipid.lab.trial.controllers import ROWS
 from slipid.robot import closed_loop
+from slipid.robot.controller import NO_CONTROLLER
 from slipid.robot.deployed import DeployedRobot
 from slipid.support.progress import Reporter
 
@@ -84,7 +85,7 @@ def drive(
         DataError: there is no such path or map, the speed is higher than that of any fitted run,
             or the map has a floor that was not identified.
     """
-    if not robot.steers:
+    if not robot.has_controller:
         raise ValueError(NO_CONTROLLER)
     reference = path_of(path, speed, robot)
     floor = twin_floor(robot) if map is None else read_map(Path(map))

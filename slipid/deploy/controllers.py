@@ -48,9 +48,11 @@ class ControllerRow:
     def drives(self, robot: DeployedRobot) -> bool:
         """Return whether the row applies to a robot.
 
-        Torque corrections have gains only for robots with three wheels.
+        Torque corrections have gains only for robots with three omni wheels.
         """
-        return self.correction == "none" or robot.wheels == PAPER_WHEELS
+        if self.correction == "none":
+            return True
+        return robot.holonomic and robot.wheels == PAPER_WHEELS
 
 
 CONTROLLERS: Mapping[str, ControllerRow] = {
@@ -104,4 +106,7 @@ def control_loop_of(
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
         gains = replace(gains, preview=jnp.asarray(0.0))  # the 2021 paper's loop has no preview
     law = None if row.law is None else row.law(robot)
-    return ControlLoop(estimator, Controller(robot, gains, correction=row.correction, law=law))
+    controller = Controller(
+        robot, gains, correction=row.correction, law=law, recovery=row.gyro or None
+    )
+    return ControlLoop(estimator, controller)

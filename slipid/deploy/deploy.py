@@ -23,6 +23,7 @@ from slipid.model.kinematics import matrices, with_lengths
 from slipid.model.robot import Robot, Validity
 from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
+from slipid.robot.controller import NO_CONTROLLER
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import MIXED_FLOORS_PENALTY
 from slipid.robot.record import (
@@ -46,13 +47,6 @@ from slipid.support.errors import DataError
 from slipid.support.files import hash_of
 
 ROBOT = "robot.json"
-NO_CONTROLLER = (
-    "the drives of this robot cannot produce every motion ahead, sideways and in yaw: the robot "
-    "has an estimator (slipid.Estimator), but no controller, so `slipid trial` and `slipid export` "
-    "are not available; identify, validate, compare, sample, selftest and design are available "
-    "(of a robot with steered wheels, identify alone)"
-)
-"""Message for robots that have no controller, see `DeployedRobot.steers`."""
 DRAWS = 64
 """Number of posterior draws in robot.json."""
 
@@ -274,7 +268,7 @@ def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()
     if not path.is_file():
         raise DataError(f"{path}: missing; write it by `slipid identify` with --out {path.parent}")
     robot = DeployedRobot.load(path, load)
-    if not robot.steers:
+    if not robot.has_controller:
         raise DataError(f"{path}: {NO_CONTROLLER}")
     try:
         return robot.on(*floors) if floors else robot

@@ -122,7 +122,7 @@ def _load(
     frame, twists = shape.frame(), directions(36)
     if not shape.determines_twist:
         twists = np.concatenate([twists, _turns(frame)])
-    speed, amps, slip = _operating_points(robot, k, top, twists)
+    speed, amps, slip, _ = _operating_points(robot, k, top, twists)
     curve = _wheel_curve(speed, amps, slip)
     return record.LoadRecord(
         name=name,
@@ -130,6 +130,9 @@ def _load(
         told=effects,
         highest_current=float(np.abs(amps).max()),
         wheel_curve=tuple((float(a), float(b)) for a, b in curve),
+        inverse_kinematics=tuple(
+            tuple(axes_of(row) for row in rows) for rows in _inverse_kinematics(robot, k, top)
+        ),
     )
 
 
@@ -157,8 +160,8 @@ def _turns(frame: WheelFrame) -> Float[np.ndarray, "twist 3"]:
 
 def _operating_points(
     robot: Robot, load: int, top: float, twists: Float[np.ndarray, "twist 3"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return wheel speeds [rad/s], currents [A] and slip ratios [1] in steady states.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return wheel speeds [rad/s], currents [A], slip ratios [1] and twists in steady states.
 
     The wheel speeds are those that without slip give each twist, scaled so that the fastest wheel
     turns at 0.4 and at 0.8 of the highest wheel speed `top` [rad/s]. Each result has a row for
@@ -173,7 +176,29 @@ def _operating_points(
     found = steady_states(robot, speed, np.repeat(np.arange(floors), len(speed) // floors), load)
     turned = radius * speed
     lost = turned - found.twist @ forward.T
-    return speed, found.current, lost / np.where(np.abs(turned) < 1e-9, 1e-9, turned)
+    slip = lost / np.where(np.abs(turned) < 1e-9, 1e-9, turned)
+    return speed, found.current, slip, found.twist
+
+
+def _inverse_kinematics(robot: Robot, load: int, top: float) -> Float[np.ndarray, "floor drive 3"]:
+    """Return the matrices from a body twist to the wheel speeds that it needs on every floor.
+
+    The matrices are fitted by least squares to steady states of the force balance, with equal
+    relative weight. The motions are straight ones, turns, and both together.
+    """
+    shape = robot.geometry
+    frame, axes = shape.frame(), [0, 1, 2] if shape.determines_twist else [0, 2]
+    straight = directions(12 if shape.determines_twist else 2)
+    turns = _turns(frame)
+    both = (0.7 * straight[:, None] + 0.5 * turns).reshape(-1, 3)
+    twists = np.concatenate([straight, turns, both])
+    speed, _, _, twist = _operating_points(robot, load, top, twists)
+    out = np.zeros((len(robot.surfaces.labels), shape.drives, 3))
+    weight = 1 / np.linalg.norm(speed, axis=-1, keepdims=True)
+    pairs = zip(np.split(weight * twist, len(out)), np.split(weight * speed, len(out)), strict=True)
+    for k, (moved, turned) in enumerate(pairs):
+        out[k][:, axes] = np.linalg.lstsq(moved[:, axes], turned)[0].T
+    return out
 
 
 def _wheel_curve(

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.robot.closed_loop import PERIOD, ControlLoop
-from slipid.robot.controller import ControllerState
 from slipid.robot.interface import Measurement, Readings, StateEstimate
+from slipid.robot.supervision import ControllerState
 
 GOLDEN_STEPS = 48
 """Number of reference steps; each sensor has readings in some of these steps, see `_inputs`."""

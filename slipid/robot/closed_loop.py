@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.parameter import as_numbers
-from slipid.robot.controller import Controller, ControllerState
+from slipid.robot.controller import Controller
 from slipid.robot.interface import (
     AbstractEstimator,
     Measurement,
@@ -20,6 +20,7 @@ from slipid.robot.interface import (
     State,
     StateEstimate,
 )
+from slipid.robot.supervision import ControllerState
 from slipid.robot.trajectory import Path
 
 PERIOD = 0.05
@@ -49,12 +50,14 @@ class ControlLoopOutput(eqx.Module):
         command: wheel speeds [rad/s].
         estimate: output of the estimator.
         time: time of the path [s].
-        gave_up: True if the robot was stuck and has stopped for good.
+        drives_off: True if wheels do not follow their commands.
+        gave_up: True if the robot was stuck and has stopped.
     """
 
-    command: Float[Array, " wheel"]
+    command: Float[Array, " drive"]
     estimate: StateEstimate
     time: Float[Array, ""]
+    drives_off: Bool[Array, ""]
     gave_up: Bool[Array, ""]
 
 
@@ -83,7 +86,8 @@ class ControlLoop(eqx.Module, Generic[State]):
         here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
         time, reference = path.follow(state.time, here, dt, self.controller.gains.preview)
         controller, command = self.controller.step(state.controller, reference, estimate, dt)
-        output = ControlLoopOutput(command, estimate, time, controller.gave_up)
+        flags = controller.drives_off, controller.gave_up
+        output = ControlLoopOutput(command, estimate, time, *flags)
         return ControlLoopState(estimator, controller, time), output
 
 
@@ -151,8 +155,8 @@ def run_closed_loop(
         plant: the robot.
         start: pose at which the estimator starts [m, m, rad].
     """
-    wheels = loop.controller.robot.wheels
-    state, reading, dt = loop.init(start), plant.reset().filled(wheels), jnp.asarray(PERIOD)
+    drives = loop.controller.robot.drives
+    state, reading, dt = loop.init(start), plant.reset().filled(drives), jnp.asarray(PERIOD)
     rows: list[tuple[float, float, tuple[float, float, float], ControlLoopOutput]] = []
     energy, path_time, time = 0.0, 0.0, 0.0
     gave_up, longest = False, DURATION_FACTOR * path.duration + 10.0
@@ -160,7 +164,7 @@ def run_closed_loop(
         state, out = _step(loop, path, state, reading, dt)
         path_time, gave_up = float(out.time), bool(out.gave_up)
         rows.append((time, energy, plant.pose, out))
-        reading = plant.step(np.asarray(out.command)).filled(wheels)
+        reading = plant.step(np.asarray(out.command)).filled(drives)
         energy += getattr(plant, "power", np.nan) * PERIOD
         time += PERIOD
     times, energies, poses, outputs = zip(*rows, strict=True)

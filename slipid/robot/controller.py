@@ -1,27 +1,33 @@
-"""Controllers compute wheel speed commands from a reference pose and an estimate.
+"""Controllers compute wheel speed commands from a demanded motion and an estimate.
 
-All controllers have the same interface, `init() -> state` and `step(state, reference, estimate, dt)
--> (state, wheel speeds)`, the same limiter, which keeps the direction of motion, and the same safe
-stop. They differ in the terms that they add to the pose loop
+A controller has two modes: `step(state, reference, estimate, dt) -> (state, wheel speeds)` follows
+a reference pose, and `drive(state, twist, estimate, dt) -> (state, wheel speeds)` drives with a
+given body twist, such as a `cmd_vel` of ROS. Both have the same limiter, which keeps the direction
+of motion, the same safe stop, and the same supervision (`slipid.robot.supervision`). Wheel speeds
+follow from the twist through the slip model that was selected for the floors believed to be under
+the wheels. The pose loop of a robot that can drive sideways is
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 
-or in a control law that replaces the pose loop. Here p [m] and heading [rad] are the estimated
-pose, p_ref and heading_ref the reference pose, v_ref [m/s] and W_ref [rad/s] its rates, v [m/s] is
-the demanded velocity in the body frame, W [rad/s] the demanded yaw rate, k and k_yaw [1/s] are
-gains, and R(-heading) rotates from world to body axes.
+and that of any other robot, with errors e in the body frame,
 
-A robot whose wheels turn while its body stands still enters recovery: it alternates between turning
-on the spot and driving, with growing effort. This helps a robot that is far from its path and stuck
-because the demands to drive and to turn cancel at the wheels with traction, so that only a wheel
-without traction spins. The controller returns to normal operation once the robot has moved for a
-while. Otherwise it stops for good and reports that it gave up.
+    v = v_ref cos(e_yaw) + k e_x,   W = W_ref + g v_ref e_y + (2 zeta w + k_yaw) 2 sin(e_yaw / 2),
+    w^2 = W_ref^2 + g v_ref^2
+
+Here p [m] and heading [rad] are the estimated pose, p_ref and heading_ref the reference pose, v_ref
+[m/s] and W_ref [rad/s] its rates, v [m/s] is the demanded velocity in the body frame, W [rad/s] the
+demanded yaw rate; k, k_yaw [1/s], g [1/m^2] and zeta [1] are gains, and R(-heading) rotates from
+world to body axes. A robot that cannot drive sideways and stands beside a resting reference first
+turns towards it.
+
+Source: Kanayama et al. 1990, ICRA; their damping vanishes at rest, which k_yaw prevents.
 
 The "2021 paper" here and in other modules is Belyaev, Brylev and Ivanov (2021), see
 docs/results.md.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -29,11 +35,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from slipid.robot.deployed import RobotArrays
+from slipid.robot.deployed import DeployedRobot, RobotArrays
 from slipid.robot.gains import Gains
 from slipid.robot.interface import UNTIMED_S, StateEstimate, as_arrays
 from slipid.robot.limits import Limits
+from slipid.robot.supervision import (
+    PROBE_S,
+    ControllerState,
+    recovery_factors,
+    supervised,
+)
 
+NO_CONTROLLER = (
+    "this robot turns by steered wheels: it has an estimator (slipid.Estimator), but no "
+    "controller; expected omni, mecanum, differential or skid-steer drives"
+)
+"""Message for robots that have no controller, see `DeployedRobot.has_controller`."""
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
 Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
 """Function from a reference (see `Path.at`) and a pose to a body twist [m/s, m/s, rad/s]."""
@@ -44,56 +61,21 @@ OBSERVER_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LARGEST_INTEGRAL = 0.06
 """Largest velocity that the integral term may add to each component [m/s]."""
-STUCK_S = 0.5
-"""Time without the demanded motion after which a robot counts as stuck, and time with the demanded
-motion after which it counts as free again [s]."""
-STUCK_SHARE, STUCK_LEAST_SPEED = 0.2, 0.1
-"""A robot counts as blocked if the demanded speed exceeds `STUCK_LEAST_SPEED` [m/s] and the
-estimated speed is below the fraction `STUCK_SHARE` [1] of the demanded speed."""
-RECOVERY_TURN_S, RECOVERY_DRIVE_S = 0.6, 1.2
-"""Durations of the alternating phases of a recovery: turning on the spot, then driving [s]."""
-RECOVERY_GROWTH = 0.6
-"""Relative growth of the demanded twist per second of recovery [1/s]."""
-RECOVERY_LIMIT_S = 15.0
-"""Duration of a recovery after which the robot stops for good [s]."""
-
-
-class ControllerState(eqx.Module):
-    """State of a controller between two steps.
-
-    Attributes:
-        command: last command [rad/s].
-        integral: velocity that the integral term adds [m/s].
-        wanted: twist that was demanded in the last step [m/s, m/s, rad/s].
-        miss: smoothed difference, estimated twist less demanded twist [m/s, m/s, rad/s].
-        still: time for which the body has not moved as demanded; it counts down while the body
-            moves as demanded [s].
-        tried: time since the present recovery began; 0 if the robot is not in recovery [s].
-        begun: True if a command has been computed already.
-    """
-
-    command: Float[Array, " wheel"]
-    integral: Float[Array, "2"]
-    wanted: Float[Array, "3"]
-    miss: Float[Array, "3"]
-    still: Float[Array, ""]
-    tried: Float[Array, ""]
-    begun: Bool[Array, ""]
-
-    @property
-    def gave_up(self) -> Bool[Array, ""]:
-        """True if the controller has stopped for good because the robot is stuck."""
-        return self.tried > RECOVERY_LIMIT_S
+RESPONSE_S = 0.15
+"""Delay and lag of wheels whose actuators are unknown [s]."""
+BESIDE_M, BESIDE_SPEED = (0.03, 0.08), 0.05
+"""Distances beside the reference between which a robot that cannot drive sideways begins to turn
+towards it [m], and speed of the reference from which on it does not [m/s]."""
 
 
 def limit_command(
-    wanted: Float[Array, " wheel"],
-    before: Float[Array, " wheel"],
-    current: Float[Array, " wheel"],
+    wanted: Float[Array, " drive"],
+    before: Float[Array, " drive"],
+    current: Float[Array, " drive"],
     robot: RobotArrays,
     limits: Limits,
     dt: Float[Array, ""] | float,
-) -> Float[Array, " wheel"]:
+) -> Float[Array, " drive"]:
     """Return wheel speeds within all limits, scaled together so that the robot keeps its direction.
 
     If a wheel exceeds the limits of speed or voltage, the whole command is scaled down. The voltage
@@ -126,24 +108,14 @@ def limit_command(
     return jnp.clip(out, -limits.wheel_speed, limits.wheel_speed)
 
 
-def _spins(tried: Float[Array, ""]) -> Bool[Array, ""]:
-    """Return whether recovery is in its phase of turning on the spot after `tried` seconds."""
-    return (tried > 0) & (jnp.mod(tried, RECOVERY_TURN_S + RECOVERY_DRIVE_S) < RECOVERY_TURN_S)
-
-
-def _recovery_factors(tried: Float[Array, ""]) -> Float[Array, "3"]:
-    """Return factors for the three components of the demanded twist after `tried` s of recovery."""
-    one = jnp.where(_spins(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
-    return jnp.where(tried > 0, one * (1 + RECOVERY_GROWTH * tried), 1.0)
-
-
 class Controller(eqx.Module):
     """Pose loop with optional correction terms, or another control law that replaces it.
 
     Attributes:
         robot: identified robot.
         gains: gains; by default those that `Gains.of` returns for the robot.
-        limits: limits of the command.
+        limits: limits of the command; by default those of the robot.
+        recovery: True if a stuck robot may try to free itself.
         correction: torque correction of the 2021 paper: "paper_print" as printed in the paper,
             "paper_code" as in the authors' program, "torque" with the errors of both corrected, or
             "none".
@@ -154,6 +126,7 @@ class Controller(eqx.Module):
     robot: RobotArrays
     gains: Gains
     limits: Limits
+    recovery: Bool[Array, ""]
     correction: Correction = eqx.field(static=True)
     law: Law | None = None
 
@@ -164,16 +137,33 @@ class Controller(eqx.Module):
         limits: Limits | None = None,
         correction: Correction = "none",
         law: Law | None = None,
+        recovery: bool | None = None,
     ):
-        self.robot, self.limits = robot.arrays, as_arrays(Limits() if limits is None else limits)
+        """Set up a controller.
+
+        `recovery` is None to try recovery only if the robot's logs have a gyro, since without gyro
+        and pose fixes nobody could see whether it works.
+
+        Raises:
+            ValueError: the robot has steered wheels.
+        """
+        if robot.steering is not None:
+            raise ValueError(NO_CONTROLLER)
+        if recovery is None:
+            recovery = isinstance(robot, DeployedRobot) and robot.record.sensors.gyro
+        self.robot, self.recovery = robot.arrays, jnp.asarray(recovery)
+        self.limits = as_arrays(Limits.of(robot) if limits is None else limits)
         self.correction, self.law = correction, law
         self.gains = Gains.of(robot) if gains is None else gains
 
     @eqx.filter_jit
     def init(self) -> ControllerState:
         """Return the controller's state before its first command."""
-        none, still, zero = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros(())
-        return ControllerState(none, jnp.zeros(2), still, still, zero, zero, jnp.zeros((), bool))
+        return ControllerState.init(self.robot.drives)
+
+    def rearmed(self, state: ControllerState) -> ControllerState:
+        """Return the state of a robot that gave up and is allowed to drive again."""
+        return state.rearmed()
 
     def step(
         self,
@@ -181,12 +171,12 @@ class Controller(eqx.Module):
         reference: Float[Array, "6"],
         estimate: StateEstimate,
         dt: Float[Array, ""] | float,
-    ) -> tuple[ControllerState, Float[Array, " wheel"]]:
-        """Return the next state and the wheel speeds to command [rad/s].
+    ) -> tuple[ControllerState, Float[Array, " drive"]]:
+        """Return the next state and the wheel speeds to command [rad/s] to follow a reference.
 
         While the estimate is stale or any input is not finite, the robot stops at the allowed
-        deceleration; once the controller has given up, it stops for good. The acceleration limit of
-        the first command is relative to the measured wheel speeds.
+        deceleration; once the controller has given up, it stops until it is armed again. The
+        acceleration limit of the first command is relative to the measured wheel speeds.
 
         Args:
             state: state from `init` or the last step.
@@ -194,71 +184,156 @@ class Controller(eqx.Module):
             estimate: output of an estimator.
             dt: time since the last step [s].
         """
-        old, e, k = state, estimate, self.gains
-        safe = e.finite & jnp.all(jnp.isfinite(reference)) & ~e.stale
-        pose = jnp.where(safe, e.pose, 0.0)
-        ref = jnp.where(safe, reference, 0.0)
-        dt = jnp.asarray(dt, dtype=float)
-        dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
+        k, usable = self.gains, self._usable(estimate, reference)
+        ref, pose = jnp.where(usable, reference, 0.0), jnp.where(usable, estimate.pose, 0.0)
         gap = ref[:2] - pose[:2]
-        safe &= ~old.gave_up
-        still, tried = self._recovery(old, e, jnp.where(safe, dt, 0.0))
-        wanted = self._demanded_twist(old, ref, pose, gap)
-        # low-pass filter the disturbance: the estimated twist less the last step's demanded twist
-        twist = jnp.where(safe, e.twist, 0.0)
-        a = 1 - jnp.exp(-dt / OBSERVER_S)
-        miss = old.miss + a * (twist - old.wanted - old.miss)
-        demand = wanted - k.observer * miss
-        wheels = self.robot.forward @ demand / self.robot.frame.radius + self._torque(wanted, e)
-        before = jnp.where(old.begun, old.command, jnp.where(safe, e.wheel_speed, 0.0))
-        wheels = jnp.where(safe, wheels, 0.0)
-        since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
-        command = limit_command(wheels, before, e.current, self.robot, self.limits, since)
+        if self.law is not None:
+            asked = self.law(ref, pose)
+        elif self.robot.holonomic:
+            asked = self._free_pose_loop(ref, pose, k.place * gap + state.integral)
+        else:
+            asked = self._tangent_pose_loop(ref, pose, gap, state.integral)
+        new, command, free = self._commanded(state, asked, estimate, dt, usable)
         # freeze the integral while a limit is active, so that it does not wind up
-        free = safe & (jnp.max(jnp.abs(command - wheels)) < 0.05)
-        summed = jnp.clip(old.integral + k.integral * gap * dt, -LARGEST_INTEGRAL, LARGEST_INTEGRAL)
-        new = ControllerState(
+        summed = state.integral + k.integral * gap * self._time_step(dt)
+        summed = jnp.clip(summed, -LARGEST_INTEGRAL, LARGEST_INTEGRAL)
+        summed = jnp.where(free, summed, jnp.where(usable, state.integral, 0.0))
+        return replace(new, integral=jnp.where(new.drives_off, 0.0, summed)), command
+
+    def drive(
+        self,
+        state: ControllerState,
+        twist: Float[Array, "3"],
+        estimate: StateEstimate,
+        dt: Float[Array, ""] | float,
+    ) -> tuple[ControllerState, Float[Array, " drive"]]:
+        """Return the next state and the wheel speeds to command [rad/s] for a body twist.
+
+        The wheel speeds compensate the slip that is expected on the floors under the wheels. A
+        robot that cannot drive sideways ignores the sideways velocity. For the rest see `step`.
+
+        Args:
+            state: state from `init` or the last step.
+            twist: demanded velocity in the body frame [m/s, m/s, rad/s].
+            estimate: output of an estimator.
+            dt: time since the last step [s].
+        """
+        usable = self._usable(estimate, twist)
+        asked = jnp.where(usable, twist, 0.0)
+        if not self.robot.holonomic:
+            asked = asked.at[1].set(0.0)
+        new, command, _ = self._commanded(state, asked, estimate, dt, usable)
+        return replace(new, integral=jnp.zeros(2)), command
+
+    def _usable(self, e: StateEstimate, demand: Array) -> Bool[Array, ""]:
+        """Return whether the estimate and the demand can be used."""
+        return e.finite & jnp.all(jnp.isfinite(demand)) & ~e.stale
+
+    def _time_step(self, dt: Float[Array, ""] | float) -> Float[Array, ""]:
+        """Return a time step limited to half a second; 0 if it is not a positive number [s]."""
+        dt = jnp.asarray(dt, dtype=float)
+        return jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
+
+    def _commanded(
+        self,
+        old: ControllerState,
+        asked: Float[Array, "3"],
+        e: StateEstimate,
+        dt: Float[Array, ""] | float,
+        usable: Bool[Array, ""],
+    ) -> tuple[ControllerState, Float[Array, " drive"], Bool[Array, ""]]:
+        """Return the next state, wheel speeds [rad/s], and whether no limit is active."""
+        f, k, dt = self.robot, self.gains, self._time_step(dt)
+        now = replace(
+            e,
+            twist=jnp.where(usable, e.twist, 0.0),
+            wheel_speed=jnp.where(usable, e.wheel_speed, 0.0),
+        )
+        probe = PROBE_S * self.limits.acceleration / f.frame.radius
+        new = supervised(
+            old,
+            asked,
+            now,
+            jnp.where(usable, dt, 0.0),
+            recovery=self.recovery,
+            highest_speed=self.limits.speed,
+            probe=probe,
+            response=jnp.asarray(RESPONSE_S),
+        )
+        drives = usable & ~new.gave_up
+        wanted = self._limited_twist(asked * recovery_factors(old.tried))
+        # low-pass filter the disturbance: the estimated twist less the last step's demanded twist
+        a = 1 - jnp.exp(-dt / OBSERVER_S)
+        miss = old.miss + a * (now.twist - old.wanted - old.miss)
+        demand = wanted - k.observer * miss
+        wheels = self._wheel_speeds(demand, e) + self._torque(wanted, e)
+        # a small speed shows whether drives that were off turn again
+        most = jnp.max(jnp.abs(wheels))
+        slower = jnp.where(new.drives_off, jnp.minimum(probe / jnp.maximum(most, 1e-9), 1.0), 1.0)
+        wheels = jnp.where(drives, wheels * slower, 0.0)
+        before = jnp.where(old.begun, old.command, jnp.where(drives, e.wheel_speed, 0.0))
+        since = jnp.where(drives, dt, jnp.maximum(dt, UNTIMED_S))
+        command = limit_command(wheels, before, e.current, f, self.limits, since)
+        miss = jnp.where(drives & ~new.drives_off, jnp.clip(miss, -0.2, 0.2), 0.0)
+        new = replace(
+            new,
             command=command,
-            integral=jnp.where(free, summed, jnp.where(safe, old.integral, 0.0)),
-            wanted=jnp.where(safe, demand, 0.0),
-            miss=jnp.where(safe, jnp.clip(miss, -0.2, 0.2), 0.0),
-            still=still,
-            tried=tried,
+            wanted=jnp.where(drives, demand, 0.0),
+            miss=miss,
             begun=jnp.ones((), bool),
         )
-        return new, command
+        return new, command, drives & (jnp.max(jnp.abs(command - wheels)) < 0.05)
 
-    def _recovery(self, old: ControllerState, e: StateEstimate, dt: Array) -> tuple[Array, Array]:
-        """Return the new `still` and `tried` of `ControllerState` [s].
+    def _wheel_speeds(self, twist: Array, e: StateEstimate) -> Float[Array, " drive"]:
+        """Return the wheel speeds that move the body with a twist on the floors believed [rad/s].
 
-        While the robot turns on the spot no translation is demanded, so `still` does not change
-        during that phase.
+        On an unknown floor the wheels are assumed to roll without slip.
         """
-        demand = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
-        speed = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
-        blocked = e.immobilised | ((demand > STUCK_LEAST_SPEED) & (speed < STUCK_SHARE * demand))
-        since = jnp.where(_spins(old.tried), 0.0, jnp.where(blocked, dt, -dt))
-        still = jnp.clip(old.still + since, 0.0, 2 * STUCK_S)
-        tries = still > STUCK_S
-        still = jnp.where(tries & (old.tried == 0), 2 * STUCK_S, still)
-        return still, jnp.where(tries, old.tried + dt, 0.0)
+        f = self.robot
+        under = f.on_average(e.surface_probability[:, :-1].T)
+        rolling = f.forward @ twist / f.frame.radius
+        slipping = jnp.sum(under * (f.inverse_kinematics @ twist), axis=0)
+        wheels = slipping + (1 - jnp.sum(under, axis=0)) * rolling
+        return jnp.where(jnp.isfinite(wheels), wheels, 0.0)
 
-    def _demanded_twist(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
-        """Return the twist [m/s, m/s, rad/s] that the pose loop or the control law demands.
+    def _limited_twist(self, wanted: Array) -> Float[Array, "3"]:
+        """Return a twist within the limits of speed and yaw rate.
 
-        In recovery it is multiplied by `_recovery_factors`; then it is scaled to the speed limit.
+        A robot that can drive sideways keeps the direction of its velocity, any other robot the
+        curvature of its path.
         """
-        wanted = self._pose_loop(old, ref, pose, gap) if self.law is None else self.law(ref, pose)
-        wanted = wanted * _recovery_factors(old.tried)
         fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.speed
-        return wanted.at[:2].divide(jnp.maximum(fast, 1.0))
+        quick = jnp.abs(wanted[2]) / self.limits.yaw_rate
+        over = jnp.stack([fast, fast, quick])
+        if not self.robot.holonomic:
+            over = jnp.max(over)
+        return wanted / jnp.maximum(over, 1.0)
 
-    def _pose_loop(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
-        """Return the twist that the pose loop demands [m/s, m/s, rad/s]."""
-        v = ref[3:5] + self.gains.place * gap + old.integral
-        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-        turn = ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])
-        return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
+    def _free_pose_loop(self, ref: Array, pose: Array, pull: Array) -> Array:
+        """Return the twist demanded of a robot that can drive sideways [m/s, m/s, rad/s].
+
+        `pull` is the velocity towards the reference, in world axes [m/s].
+        """
+        x, y = _rotated(ref[3:5] + pull, -pose[2])
+        return jnp.stack([x, y, ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])])
+
+    def _tangent_pose_loop(self, ref: Array, pose: Array, gap: Array, integral: Array) -> Array:
+        """Return the twist demanded of a robot that cannot drive sideways [m/s, 0, rad/s]."""
+        k = self.gains
+        ahead, left = _rotated(gap, -pose[2])
+        off = jnp.arctan2(jnp.sin(ref[2] - pose[2]), jnp.cos(ref[2] - pose[2]))
+        speed = ref[3] * jnp.cos(ref[2]) + ref[4] * jnp.sin(ref[2])
+        # beside a resting reference the robot first turns towards it, or away to drive in reverse
+        near, far = BESIDE_M
+        aside = jnp.clip((jnp.abs(_rotated(gap, -ref[2])[1]) - near) / (far - near), 0.0, 1.0)
+        aside *= jnp.clip(1 - jnp.abs(speed) / BESIDE_SPEED, 0.0, 1.0)
+        bearing = jnp.arctan2(left * jnp.where(ahead < 0, -1.0, 1.0), jnp.abs(ahead) + 1e-9)
+        turn = (1 - aside) * off + aside * bearing
+        stiff = 2 * k.damping * jnp.sqrt(ref[5] ** 2 + k.lateral * speed**2 + 1e-12) + k.yaw
+        yaw_rate = ref[5] + k.lateral * speed * left + stiff * 2 * jnp.sin(0.5 * turn)
+        v = speed * jnp.maximum(jnp.cos(off), 0.0) + k.place * ahead
+        v += _rotated(integral, -pose[2])[0]
+        return jnp.stack([v, jnp.zeros(()), yaw_rate])
 
     def _torque(self, wanted: Array, e: StateEstimate) -> Array:
         """Return the 2021 paper's correction of wheel speeds for forces across the motion [rad/s].
@@ -266,7 +341,7 @@ class Controller(eqx.Module):
         It is 0 with the correction "none".
         """
         if self.correction == "none":
-            return jnp.zeros(self.robot.wheels)
+            return jnp.zeros(self.robot.drives)
         f = self.robot
         turning = jnp.where(jnp.abs(e.wheel_speed) > 0.1, jnp.sign(e.wheel_speed), 0.0)
         torque = f.motor.characteristic(jnp.abs(e.current) * turning, e.wheel_speed)
@@ -289,3 +364,9 @@ class Controller(eqx.Module):
         moves = jnp.max(jnp.abs(e.wheel_speed)) > 0.5
         rpm = jnp.where(moves, gain * moment, 0.0)
         return rpm * (2 * np.pi / 60) / f.motor.gear_ratio
+
+
+def _rotated(v: Float[Array, "2"], angle: Array) -> tuple[Array, Array]:
+    """Return the components of a vector turned by an angle [rad]."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return c * v[0] - s * v[1], s * v[0] + c * v[1]

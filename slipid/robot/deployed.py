@@ -39,7 +39,7 @@ from slipid.robot.record import (
     axes_of,
     plain,
 )
-from slipid.robot.robot_file import REWRITE_HINT, check_record, geometry_of, read_robot, write_robot
+from slipid.robot.robot_file import REWRITE_HINT, check_record, read_robot, write_robot
 from slipid.support.errors import DataError
 
 
@@ -74,8 +74,12 @@ class RobotArrays(Drives):
             fitted over all floors.
         drive_of: drive of each wheel, see `slipid.model.geometry.Drives`.
         around: order of the wheels around the body, see `slipid.model.geometry.Geometry`.
+        holonomic: True if the wheels determine motion ahead, sideways and in yaw; other robots
+            cannot drive sideways.
         kinematics: matrix from wheel speeds to the body twist on each floor, zero where the force
             balance is used [m/rad, m/rad, 1].
+        inverse_kinematics: matrix from a body twist to wheel speeds on each floor: the inverse of
+            `kinematics`, or of the force balance, linearised [rad/m, rad/m, 1].
         unseen: for each floor, True if no run drove on it.
         calibrated: for each floor, True if `kinematics` is used while all wheels are on it.
         steering: steering on each floor of a robot that steers, which has no force balance; None
@@ -99,8 +103,10 @@ class RobotArrays(Drives):
     highest: Float[Array, "2"]
     wheel_curve: Float[Array, "drive 2"]
     kinematics: Float[Array, "floor 3 drive"]
+    inverse_kinematics: Float[Array, "floor drive 3"]
     drive_of: tuple[int, ...] = eqx.field(static=True)
     around: tuple[int, ...] = eqx.field(static=True)
+    holonomic: bool = eqx.field(static=True)
     unseen: tuple[bool, ...] = eqx.field(static=True)
     calibrated: tuple[bool, ...] = eqx.field(static=True)
     steering: Steering | None = eqx.field(default=None, kw_only=True)
@@ -143,14 +149,9 @@ class DeployedRobot(RobotArrays):
     load_setup: str = eqx.field(static=True)
 
     @property
-    def steers(self) -> bool:
-        """True if the wheels can produce every body twist and each wheel has its own motor.
-
-        Only such a robot has a controller, since `slipid.robot.controller` demands sideways motion
-        too; all other robots have only an estimator.
-        """
-        shape = geometry_of(self.record)
-        return not shape.drive_of and shape.determines_twist
+    def has_controller(self) -> bool:
+        """True unless wheels are steered: a robot that steers has only an estimator."""
+        return self.steering is None
 
     @classmethod
     def of(cls, record: RobotRecord, load: str | None = None) -> "DeployedRobot":
@@ -302,14 +303,36 @@ def _arrays(
         kinematics=as_numbers(
             [floor.kinematics or np.zeros((3, geometry.drives)) for floor in floors]
         ),
+        inverse_kinematics=as_numbers(_inverse_kinematics(record, chosen, geometry)),
         drive_of=wheels.drive_of,
         around=geometry.around,
+        holonomic=geometry.determines_twist,
         unseen=tuple(floor.unseen for floor in floors),
         calibrated=tuple(floor.kinematics is not None for floor in floors),
         steering=_steering(record),
         record=record,
         load_setup=chosen.name,
     )
+
+
+def _inverse_kinematics(
+    record: RobotRecord, load: LoadRecord, geometry: Geometry
+) -> Float[np.ndarray, "floor drive 3"]:
+    """Return the matrices from a body twist to wheel speeds on every floor [rad/m, rad/m, 1].
+
+    Wheels roll without slip where a record has no such matrix. A robot that cannot drive sideways
+    ignores the sideways velocity.
+    """
+    rolling = np.asarray(geometry.forward()) / float(geometry.wheel_radius)
+    axes = [0, 1, 2] if geometry.determines_twist else [0, 2]
+    out = np.tile(rolling, (len(record.floors), 1, 1))
+    for k, floor in enumerate(record.floors):
+        if floor.kinematics is not None:
+            out[k] = 0.0
+            out[k][:, axes] = np.linalg.pinv(np.array(floor.kinematics)[axes])
+        elif load.inverse_kinematics is not None:
+            out[k] = load.inverse_kinematics[k]
+    return out
 
 
 def _steering(record: RobotRecord) -> Steering | None:
@@ -419,7 +442,11 @@ def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
 def _load_with_floors(load: LoadRecord, count: int) -> LoadRecord:
     """Return a load set-up extended by `count` floors whose effects are unknown."""
     spread = axes_of(np.mean(load.spread, axis=0))
-    one = replace(load, spread=load.spread + (spread,) * count)
+    inverse = load.inverse_kinematics
+    if inverse is not None:
+        middle = np.mean(inverse, axis=0)
+        inverse += (tuple(axes_of(row) for row in middle),) * count
+    one = replace(load, spread=load.spread + (spread,) * count, inverse_kinematics=inverse)
     if load.told is None:
         return one
     left, shape = axes_of(np.hypot(EFFECT, spread)), np.shape(load.told.mean)

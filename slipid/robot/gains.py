@@ -22,6 +22,10 @@ class Gains(eqx.Module):
         "time by which reference rates are read ahead on the path, to compensate the wheels' delay",
         start=0.2,
     )
+    lateral: Array = parameter(
+        "1/m^2", "g", "lateral loop of a robot that cannot drive sideways", start=10.0
+    )
+    damping: Array = parameter("1", "zeta", "damping of the lateral loop", start=0.8)
 
     @classmethod
     def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
@@ -39,4 +43,5 @@ class Gains(eqx.Module):
             return cls()
         if not (tuned.is_better or forced):
             return cls()
-        return cls(*(as_numbers(getattr(tuned.values, f.name).value) for f in fields(cls)))
+        kept = {f.name for f in fields(cls)} & {f.name for f in fields(tuned.values)}
+        return cls(**{name: as_numbers(getattr(tuned.values, name).value) for name in kept})

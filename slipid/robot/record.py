@@ -47,6 +47,7 @@ UNITS = {
     "loads.told.left": "m/m, m/m, rad/m",
     "loads.highest_current": "A",
     "loads.wheel_curve": "1, 1/A",
+    "loads.inverse_kinematics": "rad/m, rad/m, 1",
     "current_trend": "A, A*s/m",
     "highest_speed": "rad/s",
     "steering.zero": "rad",
@@ -175,6 +176,9 @@ class LoadRecord:
             speed.
         wheel_curve: a and b of the slip ratio a + b |I| of each drive at a current I, fitted over
             all floors.
+        inverse_kinematics: for each floor, rows of the matrix from a body twist to the drives'
+            wheel speeds that the force balance needs for it, linearised; None for a robot without a
+            force balance, and in files of older versions.
     """
 
     name: str
@@ -182,14 +186,17 @@ class LoadRecord:
     told: EffectRecord | None
     highest_current: float
     wheel_curve: tuple[Pair, ...]
+    inverse_kinematics: tuple[tuple[Axes, ...], ...] | None = None
 
     def on(self, rows: tuple[int, ...]) -> "LoadRecord":
         """Return the record with only the floors whose indices are `rows`."""
-        spread = tuple(self.spread[k] for k in rows)
+        spread, inverse = tuple(self.spread[k] for k in rows), self.inverse_kinematics
+        inverse = None if inverse is None else tuple(inverse[k] for k in rows)
+        kept = replace(self, spread=spread, inverse_kinematics=inverse)
         if self.told is None:
-            return replace(self, spread=spread)
+            return kept
         mean, left = (tuple(x[k] for k in rows) for x in (self.told.mean, self.told.left))
-        return replace(self, spread=spread, told=replace(self.told, mean=mean, left=left))
+        return replace(kept, told=replace(self.told, mean=mean, left=left))
 
 
 @dataclass(frozen=True)

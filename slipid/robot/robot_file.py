@@ -224,6 +224,14 @@ def check_record(record: RobotRecord) -> None:
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
         _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, drives)
+        if load.inverse_kinematics is not None:
+            _counted(
+                f"loads, {load.name}: inverse_kinematics",
+                load.inverse_kinematics,
+                len(record.floors),
+            )
+            for rows in load.inverse_kinematics:
+                _counted(f"loads, {load.name}: inverse_kinematics, rows of a floor", rows, drives)
         if load.told is not None:
             _check_effects(f"loads, {load.name}: told", load.told, len(record.floors))
     _numbers(record)

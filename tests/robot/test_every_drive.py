@@ -1,4 +1,4 @@
-"""Robots that share drives or do not drive sideways have an estimator, and no controller."""
+"""Estimators of robots that share drives or do not drive sideways."""
 
 from dataclasses import replace
 
@@ -8,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.api.robot import drive
-from slipid.deploy.deploy import read_robot
 from slipid.deploy.robot_record import moved_per_metre, spread_of
 from slipid.lab.selftest.logs import SimulatedSensors, simulate_logs
 from slipid.model.robot import build
@@ -17,7 +15,6 @@ from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.interface import Readings, Settings
 from slipid.search_space import Choice, Space
-from slipid.support.errors import DataError
 from tests.helpers.kinds import FLOORS, SHAPES, numbers, plan
 from tests.helpers.known_robot import deploy_known
 
@@ -123,13 +120,3 @@ def test_the_robot_survives_its_file(driven, tmp_path):
     assert again.drives == robot.drives == len(robot.forward)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(robot), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_it_has_no_controller(driven, tmp_path):
-    robot, _ = driven
-    assert not robot.steers
-    robot.save(tmp_path / "robot.json")
-    with pytest.raises(DataError, match=r"the robot has an estimator .* but no controller"):
-        read_robot(tmp_path)
-    with pytest.raises(ValueError, match=r"the robot has an estimator .* but no controller"):
-        drive(robot)

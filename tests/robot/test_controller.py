@@ -1,0 +1,154 @@
+"""Controllers of every drive: both modes, drives that are off, and robots that steer."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from slipid.model.kinematics import Steering
+from slipid.model.robot import build, steady_states
+from slipid.robot.controller import Controller
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.estimator import Odometry
+from slipid.robot.gains import Gains
+from slipid.robot.interface import Readings
+from slipid.robot.supervision import OFF_S, PROBE_S
+from slipid.search_space import Choice, Space
+from tests.helpers.kinds import FLOORS, SHAPES, numbers
+from tests.helpers.known_robot import deploy_known
+
+DT = 0.05
+ASKED = np.array([0.2, 0.0, 0.2])
+"""Demanded twist [m/s, m/s, rad/s]."""
+
+
+@pytest.fixture(scope="module", params=list(SHAPES))
+def truth(request):
+    """The model of a robot with known parameters."""
+    robot = build(SHAPES[request.param], list(FLOORS), ("as_built",), ("today",))
+    choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
+    return Space(robot, choices).template
+
+
+@pytest.fixture(scope="module")
+def robot(truth) -> DeployedRobot:
+    return deploy_known(truth)
+
+
+@eqx.filter_jit
+def cut(robot, dead):
+    """Drive at `ASKED` with wheels that stand while `dead` is true, and else turn as commanded."""
+    estimator, controller = Odometry(robot), Controller(robot, Gains(), recovery=True)
+    nothing = Readings.nothing(robot.drives)
+
+    def step(carry, stands):
+        (e, c), angle = carry
+        angle = angle + jnp.where(stands, 0.0, c.command) * DT
+        e, estimate = estimator.advance(e, replace(nothing, wheel_angle=angle), jnp.asarray(DT))
+        c, command = controller.drive(c, jnp.asarray(ASKED), estimate, DT)
+        return ((e, c), angle), (estimate.twist, command, c.drives_off, c.gave_up, c.tried)
+
+    begin = (estimator.init(), controller.init()), jnp.zeros(robot.drives)
+    return jax.lax.scan(step, begin, dead)[1]
+
+
+def patterns() -> np.ndarray:
+    """Times at which motors are cut: once for 1 to 60 s, or ten times at random."""
+    rng, steps = np.random.default_rng(0), 1500
+    since = np.arange(steps) - 100
+    rows = [(since >= 0) & (since < seconds / DT) for seconds in (1, 3, 12, 20, 60)]
+    for _ in range(10):
+        times = np.cumsum(rng.uniform(0.1, 6.0, 40)) / DT
+        rows.append(np.searchsorted(times, np.arange(steps)) % 2 == 1)
+    return np.array(rows)
+
+
+def test_a_robot_whose_motors_were_cut_drives_on_with_a_ramp(robot):
+    dead = patterns()
+    twist, command, off, gave_up, tried = (
+        np.asarray(x) for x in jax.vmap(cut, (None, 0))(robot, jnp.asarray(dead))
+    )
+    radius, limit = float(robot.frame.radius), 1.0
+    assert np.hypot(twist[..., 0], twist[..., 1]).max() <= 1.001 * ASKED[0]
+    assert np.abs(twist[..., 2]).max() <= 1.001 * ASKED[2]
+    assert np.abs(np.diff(command, axis=1)).max() * radius <= limit * DT + 1e-9
+    assert not gave_up.any()
+    assert (tried == 0).all()
+    # off within a second of the cut, with a small speed to probe; on within a second of the release
+    late = dead[:5, :-1].copy()
+    for row, flags, commands in zip(late, off, command, strict=False):
+        cuts = np.flatnonzero(row)
+        assert flags[cuts[0] + round((OFF_S + 0.3) / DT) : cuts[-1]].all()
+        assert np.abs(commands[cuts[-1]]).max() * radius <= PROBE_S * limit + 1e-9 or len(cuts) < 21
+    ended = twist[:4, -20:]
+    np.testing.assert_allclose(ended, np.broadcast_to(ASKED, ended.shape), atol=1e-6)
+    assert not off[:4, -20:].any()
+
+
+def test_the_velocity_mode_compensates_slip_on_every_floor(truth, robot):
+    """In the steady state of the force balance at the commanded wheel speeds."""
+    free = robot.holonomic
+    twists = np.array([[0.2, 0, 0], [0.2, 0, 0.3], [-0.2, 0, 0.2], [0, 0, 0.5]])
+    if free:
+        twists = np.concatenate([twists, [[0.0, 0.2, 0.0], [0.14, -0.14, 0.2]]])
+    scale = np.array([1.0, 1.0, float(robot.frame.base)])
+
+    def missed(matrix, floor):
+        speed = twists @ np.asarray(matrix).T
+        found = steady_states(truth, speed, np.full(len(twists), floor), 0).twist
+        off = scale * (found - twists)
+        return np.linalg.norm(off if free else off[:, [0, 2]], axis=1)
+
+    rolling = np.asarray(robot.forward) / float(robot.frame.radius)
+    for k in range(len(robot.labels)):
+        with_slip = missed(robot.inverse_kinematics[k], k)
+        without = missed(rolling, k)
+        assert with_slip.max() < 0.01
+        if without.max() > 0.01:
+            assert with_slip.max() < 0.35 * without.max()
+
+
+def test_a_robot_that_cannot_go_sideways_reaches_its_reference(truth):
+    """Starts beside, behind and turned away; a reference at rest, ahead, in reverse, turning."""
+    robot = deploy_known(truth)
+    if robot.holonomic:
+        return
+    controller = Controller(robot, Gains())
+
+    @eqx.filter_jit
+    def end(start, rates):
+        def step(carry, k):
+            pose, speed, waiting = carry
+            heading = rates[1] * k * DT
+            far = rates[0] * k * DT
+            ref = jnp.stack([far, 0.0, heading, rates[0], 0.0, rates[1]])
+            v, _, turn = controller._limited_twist(
+                controller._tangent_pose_loop(ref, pose, ref[:2] - pose[:2], jnp.zeros(2))
+            )
+            waiting = jnp.roll(waiting, 1, axis=0).at[0].set(jnp.stack([v, turn]))
+            speed = speed + 0.7 * (waiting[2] - speed)
+            middle = pose[2] + 0.5 * speed[1] * DT
+            moved = jnp.stack([speed[0] * jnp.cos(middle), speed[0] * jnp.sin(middle), speed[1]])
+            return (pose + moved * DT, speed, waiting), ref
+
+        begin = jnp.asarray(start, float), jnp.zeros(2), jnp.zeros((4, 2))
+        (pose, _, _), refs = jax.lax.scan(step, begin, jnp.arange(600.0))
+        off = pose - refs[-1, :3]
+        return off.at[2].set(jnp.arctan2(jnp.sin(off[2]), jnp.cos(off[2])))
+
+    starts = [(0, 0.3, 0), (0, -0.3, 2.5), (0.2, 0.1, -3.0), (-0.3, 0.0, 0.5), (0.1, 0.5, 1.6)]
+    for rates in ((0.2, 0.0), (-0.2, 0.0), (0.0, 0.5), (0.0, 0.0)):
+        for start in starts:
+            x, y, yaw = np.asarray(end(start, jnp.asarray(rates)))
+            # a reference at rest is reached to where the robot no longer turns towards it
+            assert np.hypot(x, y) < (0.055 if rates[0] == 0 else 0.06), (rates, start)
+            assert abs(yaw) < 0.25, (rates, start)
+
+
+def test_a_robot_that_steers_has_no_controller(robot):
+    steering = Steering(*jnp.zeros((5, len(robot.labels))))
+    with pytest.raises(ValueError, match=r"steered wheels.* expected omni, mecanum, differential"):
+        Controller(replace(robot, steering=steering), Gains())
