@@ -394,7 +394,9 @@ def test_impossible_trials_are_refused(tmp_path, deployed):
     for speed in (0.0, 0.31, float("nan")):
         with pytest.raises(DataError, match=r"expected a speed above 0 and at most 0\.3 m/s"):
             path_of("circle", speed, deployed)
-    pair = deploy_known(build(differential(0.2, 0.04), ["firm"]), highest_speed=7.5)
+    pair = deploy_known(build(differential(0.2, 0.04), ["firm"]), highest_speed=20.0)
+    with pytest.raises(DataError, match=r"at most 0\.5 m/s, the robot's limit"):
+        path_of("circle", 0.6, pair)
     with pytest.raises(DataError, match=r"'turning' for this robot; expected .*, clothoid$"):
         path_of("turning", 0.2, pair)
     np.testing.assert_allclose(path_of("rectangle", 0.2, pair).corners[0], [1.35, 0.0])
