@@ -18,6 +18,7 @@ with the parameters and compensates for them.
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from types import MappingProxyType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -105,7 +106,7 @@ def robot_record(
     )
 
 
-def _known(settings: Mapping[str, record.Setting], group: str) -> dict[str, record.Setting]:
+def _known(settings: Mapping[str, record.Setting], group: str) -> dict[str, Any]:
     """Return the settings of a group, keyed by name."""
     start = f"{group}."
     return {path.removeprefix(start): s for path, s in settings.items() if path.startswith(start)}

@@ -5,7 +5,7 @@ is what sensors show while the wheels rest. A quantity of which the logs show to
 out.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -83,16 +83,15 @@ def _limits(logs: Sequence[Log], shape: Geometry) -> Iterator[tuple[str, float]]
         yield "limits.yaw_rate", top["yaw_rate"]
     if accelerations:
         yield "limits.acceleration", float(np.quantile(accelerations, RUNS))
-    volts = [float(np.nanquantile(np.abs(log.voltage), ROWS)) for log in logs if _has(log.voltage)]
-    supply = [float(np.nanquantile(log.bus_voltage, ROWS)) for log in logs if _has(log.bus_voltage)]
-    if supply:
-        yield "limits.voltage", max(supply)
-    elif volts:
-        yield "limits.voltage", HEADROOM * max(volts)
+    supply = _highest(log.bus_voltage for log in logs)
+    of_motors = HEADROOM * _highest(log.voltage for log in logs)
+    yield "limits.voltage", supply if np.isfinite(supply) else of_motors
 
 
-def _has(values: np.ndarray | None) -> bool:
-    return values is not None and bool(np.isfinite(values).any())
+def _highest(channels: Iterable[np.ndarray | None]) -> float:
+    """Return the highest magnitude of a channel in any run; nan if no run has it."""
+    logged = [np.abs(values[np.isfinite(values)]) for values in channels if values is not None]
+    return max((float(np.quantile(x, ROWS)) for x in logged if len(x)), default=np.nan)
 
 
 def _rates(

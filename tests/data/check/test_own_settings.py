@@ -64,6 +64,11 @@ def test_noise_and_limits_that_were_put_into_logs_are_recovered():
     assert found["sensors.stale_s"] == 0.2
 
 
+def test_the_supply_is_known_where_its_voltage_is_logged():
+    battery = [replace(log, bus_voltage=np.full(log.samples, 24.0)) for log in LOGS]
+    assert own_settings(battery, SHAPE)["limits.voltage"] == 24.0
+
+
 def test_a_spike_of_one_row_is_no_limit():
     bad = LOGS[0].wheel_angle.copy()
     bad[300] += 5.0
