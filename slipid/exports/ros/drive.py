@@ -200,7 +200,10 @@ def _diff(robot: DeployedRobot, floor: int) -> DriveController | None:
     ahead = signs[:, None] * speeds
     # the controller has one radius for each side, and one separation
     left, right = (1 / float(ahead[rows, 0].mean()) for rows in drives)
-    levers = [s * r * ahead[rows, 2].mean() for s, r, rows in zip((-1, 1), (left, right), drives, strict=True)]
+    levers = [
+        s * r * ahead[rows, 2].mean()
+        for s, r, rows in zip((-1, 1), (left, right), drives, strict=True)
+    ]
     apart, radius = float(sum(levers)), float(robot.frame.radius)
     nominal = float(y[sides[0]].mean() - y[sides[1]].mean())
     own = np.zeros_like(speeds)

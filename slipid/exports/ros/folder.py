@@ -135,8 +135,12 @@ def _covariances(
         f"Variances of velocities [m^2/s^2, rad^2/s^2]: (effect^2 + slip^2) v^2 + process^2 v / T "
         f"at v = {short(speed)} m/s, the highest rim speed of the fitted runs, and a message every "
         f"T = {short(PERIOD_S)} s."
-        + ("" if e.sideways else " The sideways velocity is that of "
-            "the sideslip, which the pose does not include: turning back undoes it.")
+        + (
+            ""
+            if e.sideways
+            else " The sideways velocity is that of "
+            "the sideslip, which the pose does not include: turning back undoes it."
+        )
     )
     variances = e.pose(DISTANCE_M), e.twist(speed, PERIOD_S)
     return tuple(
@@ -174,7 +178,11 @@ def _controller(drive: DriveController | None) -> str:
     """Return the paragraphs about the controller manager and the controller's kinematics."""
     if drive is None:
         return filled("ros2/no_drive.md", {"SHARE": f"{LARGEST_DIFFERENCE:.0%}"}).rstrip()
-    missing = "one radius for each side and one wheel separation" if drive.by_floor else "no parameters for drive directions of single wheels"
+    missing = (
+        "one radius for each side and one wheel separation"
+        if drive.by_floor
+        else "no parameters for drive directions of single wheels"
+    )
     difference = (
         f"differ from the identified kinematics by at most {short(100 * drive.difference)} % of a "
         f"rim speed, since the controller has {missing}."

@@ -9,8 +9,8 @@ robot's model. A constant covariance cannot depend on the direction of travel, s
 the larger of the variances along and across; only the velocity of a robot that cannot drive
 sideways always has the same direction in its own frame. Such a robot slips sideways as it turns
 about a centre of rotation ahead of or behind its origin: turning back undoes this shift of the
-origin, so that it counts in the velocity but not in the pose. A wrong heading moves the robot sideways;
-with the values e_w and q_w of e and q in yaw, this adds the variance
+origin, so that it counts in the velocity but not in the pose. A wrong heading moves the robot
+sideways; with the values e_w and q_w of e and q in yaw, this adds the variance
 (e_w d^2 / 2)^2 + q_w^2 d^3 / 3 across.
 
 ROS drive controllers put one constant diagonal into every message, although the true covariance of

@@ -12,16 +12,15 @@ from slipid.exports.text import filled
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import DeployedRobot
 
-PACKAGES = (
+MESSAGES = (
     "diagnostic_msgs",
     "geometry_msgs",
     "nav_msgs",
-    "rclcpp",
     "sensor_msgs",
     "std_msgs",
     "std_srvs",
 )
-"""ROS packages that the node depends on."""
+"""ROS packages with the messages of the node."""
 
 
 def package_files(robot: DeployedRobot, twist: Sequence[float]) -> dict[str, str]:
@@ -34,8 +33,8 @@ def package_files(robot: DeployedRobot, twist: Sequence[float]) -> dict[str, str
     joints = [joint(of.index(drive)) for drive in range(robot.drives)]
     values = {
         "NUMBERS": robot.record.numbers,
-        "DEPENDS": [f"  <depend>{name}</depend>" for name in PACKAGES],
-        "PACKAGES": " ".join(PACKAGES),
+        "DEPENDS": [f"  <depend>{name}</depend>" for name in ("rclcpp", *MESSAGES)],
+        "PACKAGES": " ".join(MESSAGES),
         "JOINTS": ", ".join(f'"{name}"' for name in joints),
         "GYRO": str(robot.record.sensors.gyro).lower(),
         "PERIOD": str(round(1000 * PERIOD)),

@@ -109,7 +109,7 @@ class SlipidNode : public rclcpp::Node {
     }
     for (std::size_t i = 0; i < 3; ++i) {
       for (std::size_t k = 0; k < 3; ++k) {
-        m.pose.covariance[6 * axes[i] + axes[k]] = estimate.covariance[i][k];
+        m.pose.covariance[6 * axes[i] + axes[k]] = estimate.covariance[3 * i + k];
       }
     }
     odometry_->publish(m);
