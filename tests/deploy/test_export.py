@@ -188,3 +188,12 @@ def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, 
     monkeypatch.setattr(made, lambda *_, **__: pytest.fail("made"))
     with pytest.raises(DataError, match="files that an export did not write"):
         export(ROBOT, tmp_path, ExportOptions(), QUIET)
+
+
+@pytest.mark.slow
+def test_recovery_is_an_option_of_an_export(folder, tmp_path):
+    """It is off by default for a robot without a gyro."""
+    assert "recovery is off in this export" in (folder / "c/README.md").read_text()
+    options = ExportOptions(("c",), "slip_odometry", recovery=True)
+    export(ROBOT, tmp_path / "on", options, QUIET)
+    assert "recovery is off" not in (tmp_path / "on/c/README.md").read_text()
