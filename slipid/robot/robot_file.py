@@ -218,8 +218,11 @@ def check_record(record: RobotRecord) -> None:
                 f"{kind} {list(names)}; expected at least one name, and each name only once"
             )
     for floor in record.floors:
-        for row in floor.kinematics or ():
-            _counted(f"floors, {floor.name}: kinematics", row, drives)
+        for name in ("kinematics", "calibration"):
+            for row in getattr(floor, name) or ():
+                _counted(f"floors, {floor.name}: {name}", row, drives)
+    for row in record.nominal or ():
+        _counted("nominal", row, drives)
     _steered(record)
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
