@@ -76,7 +76,9 @@ class ControllerRow:
 CONTROLLERS: Mapping[str, ControllerRow] = {
     "encoder": ControllerRow("encoder", "odometry from encoders, without slip"),
     "calibrated": ControllerRow(
-        "calibrated", "odometry from encoders with calibrated lengths (effective track and radius)"
+        "calibrated",
+        "odometry from encoders with calibrated lengths (effective track and radius)",
+        tuned=True,
     ),
     "slip_odometry": ControllerRow("curve", "odometry corrected by slip over current (figure 5)"),
     "paper_print": ControllerRow(
@@ -107,11 +109,13 @@ def control_loop_of(
     settings: Settings | None = None,
     forced: bool = False,
     floor: Floor | None = None,
+    recovery: bool | None = None,
 ) -> ControlLoop[eqx.Module]:
     """Return the control loop of a row for a robot.
 
     Tuned gains are used only if `row.tuned` is True, and only if they are better than the gains set
-    by hand or `forced` is True. `floor` is used only if `row.mapped` is True.
+    by hand or `forced` is True. `floor` is used only if `row.mapped` is True. `recovery` is True if
+    a stuck robot may try to free itself; None if the row has a gyro or the robot's logs have one.
 
     Raises:
         DataError: the row does not apply to the robot.
@@ -126,10 +130,13 @@ def control_loop_of(
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
+    if row.observer in ("encoder", "curve"):
         gains = replace(gains, preview=jnp.asarray(0.0))  # the 2021 paper's loop has no preview
+    if recovery is None and row.gyro:
+        recovery = True
     law = None if row.law is None else row.law(robot)
     controller = Controller(
-        robot, gains, correction=row.correction, law=law, recovery=row.gyro or row.fixed or None
+        robot, gains, correction=row.correction, law=law, recovery=recovery
     )
     return ControlLoop(estimator, controller)
 

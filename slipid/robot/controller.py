@@ -39,6 +39,7 @@ from slipid.robot.deployed import DeployedRobot, RobotArrays
 from slipid.robot.gains import Gains
 from slipid.robot.interface import UNTIMED_S, StateEstimate, as_arrays
 from slipid.robot.limits import Limits
+from slipid.robot.record import ActuatorRecord
 from slipid.robot.supervision import (
     PROBE_S,
     ControllerState,
@@ -66,7 +67,7 @@ HEADING_ARM_M = 0.2
 """Lever at which a heading that lags behind the path counts as a distance that lags, for robots
 that cannot drive sideways [m]."""
 RESPONSE_S = 0.15
-"""Delay and lag of wheels whose actuators are unknown [s]."""
+"""Delay and lag, together, of wheels whose actuators are unknown [s]."""
 BESIDE_M, BESIDE_SPEED = (0.03, 0.08), 0.05
 """Distances beside the reference between which a robot that cannot drive sideways begins to turn
 towards it [m], and speed of the reference from which on it does not [m/s]."""
@@ -120,6 +121,7 @@ class Controller(eqx.Module):
         gains: gains; by default those that `Gains.of` returns for the robot.
         limits: limits of the command; by default those of the robot.
         recovery: True if a stuck robot may try to free itself.
+        response: delay and lag, together, with which the wheels follow commands [s].
         correction: torque correction of the 2021 paper: "paper_print" as printed in the paper,
             "paper_code" as in the authors' program, "torque" with the errors of both corrected, or
             "none".
@@ -131,6 +133,7 @@ class Controller(eqx.Module):
     gains: Gains
     limits: Limits
     recovery: Bool[Array, ""]
+    response: Float[Array, ""]
     correction: Correction = eqx.field(static=True)
     law: Law | None = None
 
@@ -156,6 +159,9 @@ class Controller(eqx.Module):
         if recovery is None:
             recovery = isinstance(robot, DeployedRobot) and robot.record.sensors.gyro
         self.robot, self.recovery = robot.arrays, jnp.asarray(recovery)
+        actuators = robot.record.actuators if isinstance(robot, DeployedRobot) else ActuatorRecord()
+        late = RESPONSE_S if actuators.response_s is None else actuators.response_s
+        self.response = jnp.asarray(late, dtype=float)
         self.limits = as_arrays(Limits.of(robot) if limits is None else limits)
         self.correction, self.law = correction, law
         self.gains = Gains.of(robot) if gains is None else gains
@@ -270,7 +276,7 @@ class Controller(eqx.Module):
             recovery=self.recovery,
             highest_speed=self.limits.speed,
             probe=probe,
-            response=jnp.asarray(RESPONSE_S),
+            response=self.response,
         )
         moves = usable & ~new.gave_up
         wanted = self._limited_twist(asked * recovery_factors(old.tried))

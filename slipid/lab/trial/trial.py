@@ -275,7 +275,8 @@ def drive(task: TrialTask) -> None:
     if row.fixed:
         plant = TruePosePlant(plant)
     there = floor_of(task.known_map, robot.labels)
-    loop = control_loop_of(robot, row, task.settings, task.forced, there)
+    sees = row.gyro or row.fixed
+    loop = control_loop_of(robot, row, task.settings, task.forced, there, recovery=sees)
     driven = closed_loop.run_closed_loop(loop, path, plant, task.start)
     off = driven.pose[-1] - driven.estimated_pose[-1]
     run = TrialRun(

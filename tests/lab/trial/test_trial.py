@@ -206,11 +206,11 @@ def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
     tuned = Gains(*TUNED)
     robot = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
     for row in ROWS.values():
-        if row.law is not None:  # it takes a second to make
+        if row.law is not None or row.obstacle(robot):  # a law takes a second to make
             continue
         found = control_loop_of(robot, row).controller.gains
         expected = tuned if row.tuned else Gains()
-        if row.observer != "contact":
+        if row.observer in ("encoder", "curve"):
             expected = replace(expected, preview=jnp.asarray(0.0))
         assert values(found) == values(expected)
 
@@ -568,7 +568,7 @@ def test_a_controller_can_have_another_map_than_the_true_one(tmp_path, deployed,
     class Told(Exception):
         pass
 
-    def caught(robot, row, settings, forced, floor):
+    def caught(robot, row, settings, forced, floor, recovery):
         raise Told(floor)
 
     monkeypatch.setattr(tr, "control_loop_of", caught)
