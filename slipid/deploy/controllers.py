@@ -135,9 +135,7 @@ def control_loop_of(
     if recovery is None and row.gyro:
         recovery = True
     law = None if row.law is None else row.law(robot)
-    controller = Controller(
-        robot, gains, correction=row.correction, law=law, recovery=recovery
-    )
+    controller = Controller(robot, gains, correction=row.correction, law=law, recovery=recovery)
     return ControlLoop(estimator, controller)
 
 

@@ -150,9 +150,7 @@ def with_kinematics(
         names = ("zero_rad", "gain", "understeer")
         steering = SteeringRecord(*(found.steering[name].value for name in names))
     nominal = rows_of(rolling * one)
-    return replace(
-        record, floors=tuple(floors), loads=loads, steering=steering, nominal=nominal
-    )
+    return replace(record, floors=tuple(floors), loads=loads, steering=steering, nominal=nominal)
 
 
 def _without_effects(

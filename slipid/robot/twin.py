@@ -10,8 +10,8 @@ every run, with effects as in `slipid.robot.filter.effects`:
     pose <- pose * exp(xi h + s h (estimated + remaining effect) + sqrt(s h) process)
 
 with h the substep [s], `set` the set-point speeds of the drives' speed control and w the wheel
-speeds of the drives [rad/s], r the wheel radius [m], xi the body twist [m/s, m/s, rad/s] and s the speed of the
-body if no wheel slipped [m/s].
+speeds of the drives [rad/s], r the wheel radius [m], xi the body twist [m/s, m/s, rad/s] and s the
+speed of the body if no wheel slipped [m/s].
 
 Everything is differentiable except for the choice of the floor under a wheel; derivatives ignore
 the quantization of encoders. Use forward mode (`jax.jvp`, `jax.jacfwd`), since NaN readings would

@@ -77,8 +77,11 @@ def test_every_path_closes(robot, folder):
         apart = summary["contact"]["to_calibrated"]
         gap = apart["mean_difference_mm"] / max(apart["standard_error_mm"], 1e-9)
         better, worse = gap < -2, gap > 2
-        print("contact is", "better than" if better else "worse than" if worse else "not told apart"
-              " from", "calibrated odometry")
+        print(
+            "contact is",
+            "better than" if better else "worse than" if worse else "not told apart from",
+            "calibrated odometry",
+        )
         assert QUICK or with_gyro <= MOST_OF_ENCODERS
         assert QUICK or not worse
         assert QUICK or min(row["finished_share"] for row in summary.values()) == 1.0

@@ -18,8 +18,8 @@ from slipid.deploy.export import FORMS, ExportOptions, export
 from slipid.deploy.twin_run import REST_S, starts, twin_floor
 from slipid.exports.c99.folder import c_files
 from slipid.exports.folder import check_folder
-from slipid.lab.trial.controllers import ROWS
 from slipid.lab.testsite.site import Site
+from slipid.lab.trial.controllers import ROWS
 from slipid.lab.trial.trial import SitePlant
 from slipid.robot import closed_loop
 from slipid.robot.closed_loop import PERIOD

@@ -84,9 +84,7 @@ def test_a_body_at_constant_speed_moves_as_the_contact_says():
 @pytest.mark.slow
 def test_a_body_on_a_calibrated_floor_moves_by_its_kinematics():
     """One motor a side; on both floors at once, and on the other floor, forces decide."""
-    robot = deploy_known(
-        build(skid_steer(0.15, 0.2, 0.1, drive_of=(0, 1, 0, 1)), ["firm", "soft"])
-    )
+    robot = deploy_known(build(skid_steer(0.15, 0.2, 0.1, drive_of=(0, 1, 0, 1)), ["firm", "soft"]))
     rows = ((0.04, 0.04), (0.005, -0.005), (-0.1, 0.1))
     firm, soft = robot.record.floors
     known = replace(firm, kinematics=rows)

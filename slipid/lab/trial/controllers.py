@@ -8,7 +8,6 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-
 from jaxtyping import Float
 
 from slipid.deploy.controllers import CONTROLLERS, ControllerRow

@@ -49,9 +49,10 @@ def summaries(runs: Sequence[TrialRun]) -> dict[str, Content]:
     starts; `runs`, the number of runs; and `finished_share`, the fraction of runs that reached the
     end of the path. `recovery_share` is the fraction of runs in which the controller began to free
     a robot that was stuck, and `freed_share` the fraction of those in which it drove on each time;
-    None without such a run. If the controller `encoder` was driven, a summary also has `worse_share`, the
-    fraction of starts with a larger closure error than `encoder`'s, and `to_encoder`, the ratios of
-    medians to those of `encoder`, each with its `value` and `interval90`. If the controller
+    None without such a run. If the controller `encoder` was driven, a summary also has
+    `worse_share`, the fraction of starts with a larger closure error than `encoder`'s, and
+    `to_encoder`, the ratios of medians to those of `encoder`, each with its `value` and
+    `interval90`. If the controller
     `calibrated` was driven, `to_calibrated` has the mean difference of the closure error to that of
     `calibrated` from the same starts, and its standard error [mm].
     """

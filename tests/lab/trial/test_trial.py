@@ -480,7 +480,7 @@ def test_rows_that_suit_a_robot_without_sideways_motion():
             applicable((name,), skid)
         with pytest.raises(DataError, match="expected another controller"):
             control_loop_of(skid, ROWS[name])
-    with pytest.raises(DataError, match="calibrated: robot.json has no calibration"):
+    with pytest.raises(DataError, match=r"calibrated: robot\.json has no calibration"):
         applicable(("calibrated",), skid)
 
 
@@ -488,9 +488,7 @@ def test_odometry_rolls_by_the_lengths_of_its_row():
     """Nominal lengths, the mean of calibrated ones over floors, and wheel speeds that undo them."""
     known = deploy_known(build(differential(0.2, 0.1), ["firm", "soft"]), highest_speed=20.0)
     nominal = ((0.05, 0.05), (0.0, 0.0), (-0.25, 0.25))
-    firm, soft = (
-        ((0.05 * k, 0.05 * k), (0.01, -0.01), (-0.2 * k, 0.2 * k)) for k in (0.9, 0.7)
-    )
+    firm, soft = (((0.05 * k, 0.05 * k), (0.01, -0.01), (-0.2 * k, 0.2 * k)) for k in (0.9, 0.7))
     floors = [
         replace(floor, calibration=rows)
         for floor, rows in zip(known.record.floors, (firm, soft), strict=True)
