@@ -18,7 +18,7 @@ from slipid.deploy.twin_run import (
     twin_floor,
     twin_plant,
 )
-from slipid.lab.trial.controllers import ROWS
+from slipid.lab.trial.controllers import ROWS, TruePosePlant
 from slipid.robot import closed_loop
 from slipid.robot.controller import NO_CONTROLLER
 from slipid.robot.deployed import DeployedRobot
@@ -98,7 +98,10 @@ def drive(
             "start from 0 to 19"
         )
     row, begin = ROWS[controller], places[start]
+    plant: closed_loop.Plant
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
+    if row.fixed:
+        plant = TruePosePlant(plant)
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
     driven = closed_loop.run_closed_loop(
         loop, reference.moved(begin).after_rest(REST_S), plant, begin
