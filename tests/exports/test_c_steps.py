@@ -115,7 +115,9 @@ def test_every_field_has_a_unit():
     assert plain == {
         *("floors_belief", "floors_expected", "place_toward", "begun", "slip"),
         *("drives_off", "gave_up", "limited"),
-        *("surface_probability", "stale", "immobilised", "out_of_range"),
+        *("surface_probability", "stale", "immobilised", "out_of_range", "rejected"),
+        *("wheels_rejected", "refused", "gyro_rejected"),
+        *("place_fixes_agreeing", "place_fixes_rejected"),
     }
 
 
