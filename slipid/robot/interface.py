@@ -27,6 +27,8 @@ floors [1]; it is below the default, since several floors under such a robot are
 UNTIMED_S = 0.01
 """Duration that is assumed for a step whose `dt` is invalid, so that readings still age and a stop
 still makes progress [s]."""
+PERIOD = 0.05
+"""Time between two commands [s]."""
 State = TypeVar("State", bound=eqx.Module)
 Some = TypeVar("Some", bound=eqx.Module)
 Scalar = Float[Array, ""] | float

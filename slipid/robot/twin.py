@@ -28,11 +28,10 @@ from jaxtyping import Array, Float
 from slipid.model.motor import sign_of_motion
 from slipid.model.se2 import advance, compose
 from slipid.parameter import as_numbers
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.effects import RolledMotion, effect_correlation, travel_direction
 from slipid.robot.filter.floor import Floor
-from slipid.robot.interface import Measurement, Pose, Readings
+from slipid.robot.interface import PERIOD, Measurement, Pose, Readings
 
 KEPT_COMMANDS = 6
 """Number of commands that are kept, including the newest; the delay is at most `KEPT_COMMANDS` - 1

@@ -17,10 +17,10 @@ from slipid.lab.trial.published_laws import (
     by_swarm,
     inverse_kinematics,
 )
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.controller import Law
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.gains import Gains
+from slipid.robot.interface import PERIOD
 from slipid.robot.limits import Limits
 from slipid.robot.trajectory import ROW_PERIOD, rectangle
 from slipid.robot.twin import ActuatorModel
