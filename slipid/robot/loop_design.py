@@ -128,8 +128,8 @@ class SampledPlant:
         stable = np.abs(np.linalg.eigvals(self.closed(gains))).max() < 1
         if size[-1] >= 0 or not stable:
             return -180.0, float(frequency[-1])
-        last = int(np.flatnonzero(size >= 0)[-1])
-        part = size[last] / (size[last] - size[last + 1])
+        last = max(0, int((size >= 0).sum()) - 1)
+        part = float(np.clip(size[last] / (size[last] - size[last + 1]), 0.0, 1.0))
         # phase above -180 degrees; it stays between 0 and 180 degrees in a stable loop
         above = np.unwrap(np.angle(-loop[last : last + 2]))
         margin = (1 - part) * above[0] + part * above[1]
@@ -139,7 +139,7 @@ class SampledPlant:
     @cached_property
     def _responses(self) -> tuple[np.ndarray, np.ndarray]:
         """Frequencies [Hz], and the response of each error to the command at each of them."""
-        frequency = np.geomspace(1e-5, 0.5, 4000) / self.period_s
+        frequency = np.geomspace(1e-5, 0.5, 1000) / self.period_s
         z = np.exp(2j * np.pi * frequency * self.period_s)[:, None, None]
         left = z * np.eye(len(self.matrix)) - self.matrix
         states = np.linalg.solve(left, np.broadcast_to(self.column, (*left.shape[:2], 1)))
@@ -167,19 +167,17 @@ def riccati(
 ) -> Float[np.ndarray, "state state"]:
     """Return the stabilising solution X of the discrete algebraic Riccati equation.
 
-    X = A' X A - A' X B (R + B' X B)^-1 B' X A + Q, by the doubling iteration of Chu et al.
-
-    Raises:
-        ValueError: the iteration does not converge.
+    X = A' X A - A' X B (R + B' X B)^-1 B' X A + Q, by the doubling iteration of Chu et al. The
+    input must reach all unstable states, and Q must weight them.
     """
     g, x, eye = b @ np.linalg.solve(r, b.T), q, np.eye(len(a))
-    for _ in range(60):
+    for _ in range(40):
         inverse = np.linalg.inv(eye + g @ x)
         further = a.T @ x @ inverse @ a
         a, g, x = a @ inverse @ a, g + a @ inverse @ g @ a.T, x + further
         if np.abs(further).max() <= 1e-13 * np.abs(x).max():
-            return np.asarray(0.5 * (x + x.T))
-    raise ValueError("the Riccati equation has no stabilising solution for these matrices")
+            break
+    return np.asarray(0.5 * (x + x.T))
 
 
 @dataclass(frozen=True)
@@ -208,12 +206,21 @@ def design(
         margin_deg: smallest phase margin.
         lateral: False for a loop with one error, True for offset and heading.
         most: largest gain of the heading or of the one error [1/s].
+
+    Raises:
+        ValueError: no gains have this margin.
     """
     plant = SampledPlant.of(actuator, errors=1 + lateral)
     ratios = WEIGHT_RATIOS if lateral else (1.0,)
     each = [np.array([1.0, (k * actuator.late_s) ** 2])[: plant.errors] for k in ratios]
     gains = max((_on_margin(plant, weights, margin_deg, most) for weights in each), key=_first)
-    return LoopDesign(tuple(gains.tolist()), *plant.crossover(gains))
+    found = LoopDesign(tuple(gains.tolist()), *plant.crossover(gains))
+    if found.margin_deg < margin_deg - 0.01:
+        raise ValueError(
+            f"no gains have a phase margin of {margin_deg:g} deg at a delay of "
+            f"{actuator.delay_s:g} s and a lag of {actuator.lag_s:g} s; expected a smaller margin"
+        )
+    return found
 
 
 def _first(gains: Float[np.ndarray, " error"]) -> float:
