@@ -74,7 +74,8 @@ def drive(
         controller: name of a controller of `slipid trial`: `encoder`, `contact`, `contact_map`,
             `contact_gyro`, ...
         map: path of a floor map; by default a random map of patches of the robot's floors.
-        path: `rectangle`, `circle`, `eight` or `turning`.
+        path: `rectangle`, `circle`, `eight` or `clothoid`; `turning` for a robot that drives
+            sideways.
         speed: speed along the path [m/s].
         start: index of one of twenty start poses on the map, from 0.
         seed: seed of the sensors' noise.

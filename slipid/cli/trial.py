@@ -37,7 +37,11 @@ def trial(
         str | None, option("NAMES", "Controllers separated by commas; all by default.")
     ] = None,
     path: Annotated[
-        str, option("NAME", "Path: rectangle, circle, eight, or turning (the robot also rotates).")
+        str,
+        option(
+            "NAME",
+            "Path: rectangle, circle, eight, clothoid, or turning (omni robots that also rotate).",
+        ),
     ] = "rectangle",
     speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Number of start poses.")] = 20,

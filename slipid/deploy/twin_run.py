@@ -8,6 +8,8 @@ from slipid.data.floor_map import FloorMap, patchwork
 from slipid.deploy.floors import floor_of
 from slipid.robot import trajectory
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.limits import Limits
+from slipid.robot.robot_file import geometry_of
 from slipid.robot.trajectory import Path
 from slipid.robot.twin import ActuatorModel, Twin, TwinPlant
 from slipid.support.errors import DataError
@@ -21,15 +23,19 @@ REST_S = 1.0
 def twin_floor(robot: DeployedRobot) -> FloorMap:
     """Return a map of patches about as large as the robot, on the robot's floors.
 
+    Lengths are multiplied by `path_scale`.
+
     The floor with the least slip in the fitted runs is drawn twice as often as each other floor.
     With the firm, medium and soft floors of the test site, a robot controlled by encoder odometry
     then travels 80 to 90 % of the path's first side, as on the 2021 paper's site.
     """
-    labels = robot.labels
+    labels, scale = robot.labels, path_scale(robot)
     slip = [float(np.mean(f.seen.slip)) if f.seen is not None else 0.0 for f in robot.record.floors]
     order = [labels[k] for k in np.argsort(slip)]
     names = order if len(order) == 1 else [*order, "more of the first"]
-    patches = patchwork(names, seed=SITE_SEED, patch=0.35, half=2.0)
+    patches = patchwork(
+        names, seed=SITE_SEED, patch=0.35 * scale, half=2.0 * scale, cell=0.005 * scale
+    )
     cells = np.where(patches.cells == len(order), 0, patches.cells)
     return FloorMap(tuple(order), cells, patches.corner, patches.cell)
 
@@ -38,13 +44,14 @@ def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, 
     """Return start poses [m, m, rad] spread over a site, the same poses at every call.
 
     Headings are evenly spread. The path begins at the start pose, and its middle stays at least
-    0.8 m inside the site if the site is large enough.
+    0.8 m, and half the diagonal of a larger path, inside the site if the site is large enough.
     """
     rng = np.random.default_rng(STARTS_SEED)
     x0, y0, x1, y1 = floor.extent
     middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
-    reach = np.maximum([0.5 * (x1 - x0) - 0.8, 0.5 * (y1 - y0) - 0.8], 0.0)
     places = np.asarray(path.rows)[:, :2]
+    inside = max(0.8, 0.5 * float(np.hypot(*np.ptp(places, axis=0))))
+    reach = np.maximum([0.5 * (x1 - x0) - inside, 0.5 * (y1 - y0) - inside], 0.0)
     a, b = (0.5 * (places.min(axis=0) + places.max(axis=0))).tolist()
     out = []
     for k in range(count):
@@ -68,22 +75,41 @@ def require_known_surfaces(floor: FloorMap, robot: DeployedRobot, path: str) -> 
         )
 
 
+def path_scale(robot: DeployedRobot) -> float:
+    """Return the factor of the lengths of a robot's paths and site [1].
+
+    It is the base radius over that of the Robotino, for which the paths were chosen, in steps of a
+    half, so that a fit's small corrections of the radius leave them as they are; and at least 1.
+    """
+    return max(1.0, round(2 * float(robot.frame.base) / trajectory.BASE_M) / 2)
+
+
 def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
     """Return the path called `name`, which begins at the origin, for a speed [m/s].
 
+    A robot that does not drive sideways gets a path whose heading is tangent to it, with turns on
+    the spot no faster than its limit of the yaw rate, at which its wheels move at about `speed`.
+    Lengths are multiplied by `path_scale`.
+
     Raises:
-        DataError: there is no such path, or the speed exceeds the highest rim speed of the fitted
-            runs.
+        DataError: there is no such path for this robot, or the speed exceeds the highest rim speed
+            of the fitted runs.
     """
-    if name not in trajectory.PATHS:
-        raise DataError(f"no path '{name}'; expected one of {', '.join(trajectory.PATHS)}")
+    holonomic = geometry_of(robot.record).determines_twist
+    paths = trajectory.PATHS if holonomic else trajectory.SHAPES
+    if name not in paths:
+        raise DataError(f"no path '{name}' for this robot; expected one of {', '.join(paths)}")
     most = float(robot.highest[0] * robot.frame.radius)
     if not 0 < speed <= most:
         raise DataError(
             f"speed {speed:g} m/s; expected a speed above 0 and at most {most:.2g} m/s, the "
             "highest rim speed of the fitted runs"
         )
-    return trajectory.PATHS[name](speed)
+    scale = path_scale(robot)
+    if holonomic:
+        return trajectory.PATHS[name](speed, scale)
+    yaw_rate = min(speed / (scale * trajectory.BASE_M), float(Limits.of(robot).yaw_rate))
+    return trajectory.tangent(trajectory.SHAPES[name](scale), speed, yaw_rate=yaw_rate)
 
 
 def twin_plant(

@@ -1,13 +1,24 @@
-"""Paths over time: reference poses and rates, whose time stops while the robot lags behind."""
+"""Paths over time: reference poses and rates, whose time stops while the robot lags behind.
+
+A robot whose wheels determine x, y and yaw drives along its path without turning. The heading of
+any other robot is tangent to the path, which consists of sections: on a `Section` the curvature k
+[1/m] changes linearly with the driven distance s [m], so that it is a line, an arc or a clothoid,
+and on a `Turn` the robot turns on the spot:
+
+    d heading / ds = k(s),   d (x, y) / ds = (cos heading, sin heading)
+"""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+BASE_M = 0.125
+"""Base radius of the robot for which the lengths of the named paths were chosen [m]."""
 ROW_PERIOD = 0.02
 """Time between two rows of a path [s]."""
 FULL_SPEED_M, WAIT_M = 0.02, 0.12
@@ -55,14 +66,17 @@ class Path(eqx.Module):
         pose: Float[Array, "3"],
         dt: Float[Array, ""] | float,
         preview: Float[Array, ""] | float = 0.0,
+        arm: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
         """Return the time of the path one step later, and the reference at the new time.
 
         The reference consists of the pose at the new time and the rates `preview` [s] later.
 
         The path slows down, and its rates with it, while the robot's estimated `pose` lags behind
-        the reference or is off to the side; the path does not wait for a robot that is ahead. A
-        `dt` [s] that is not a positive number counts as 0; time advances by at most `LONGEST_STEP`.
+        the reference or is off to the side. A heading that lags counts as the distance that a point
+        at the end of a lever `arm` [m] lags; with 0 headings do not count. The path does not wait
+        for a robot that is ahead. A `dt` [s] that is not a positive number counts as 0; time
+        advances by at most `LONGEST_STEP`.
         """
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST_STEP), 0.0)
@@ -70,9 +84,11 @@ class Path(eqx.Module):
         gap, v = here[:2] - pose[:2], here[3:5]
         size = jnp.sqrt(v @ v + 1e-12)
         ahead = jnp.minimum(gap @ v / size, 0.0)
-        off = jnp.sqrt(
-            jnp.maximum(gap @ gap - jnp.where(size > 1e-3, ahead, 0.0) ** 2, 0.0) + 1e-12
-        )
+        beside = jnp.maximum(gap @ gap - jnp.where(size > 1e-3, ahead, 0.0) ** 2, 0.0)
+        turn = here[2] - pose[2]
+        turn = turn - 2 * jnp.pi * jnp.floor(turn / (2 * jnp.pi) + 0.5)
+        turn = jnp.where(turn * here[5] < -1e-3 * jnp.abs(turn), 0.0, turn)
+        off = jnp.sqrt(beside + (arm * turn) ** 2 + 1e-12)
         rate = jnp.clip((WAIT_M - off) / (WAIT_M - FULL_SPEED_M), 0.0, 1.0)
         time = jnp.asarray(time) + rate * dt
         rates = self.at(time + preview)[3:] * rate
@@ -89,6 +105,11 @@ class Path(eqx.Module):
         rows[:, 3:5] = rows[:, 3:5] @ turn
         corners = np.asarray(self.corners).reshape(-1, 2) @ turn + [x, y]
         return Path(jnp.asarray(rows), self.marks, jnp.asarray(corners))
+
+    def without_turning(self) -> "Path":
+        """Return the path for a robot that drives in any direction and keeps its heading."""
+        kept = np.asarray(self.rows) * [1, 1, 0, 1, 1, 0]
+        return Path(jnp.asarray(kept), self.marks, self.corners)
 
     def after_rest(self, seconds: float) -> "Path":
         """Return the path preceded by a rest of `seconds` [s] at its start."""
@@ -154,78 +175,167 @@ def rectangle(
     return waypoints(corners, speed, turn=turn)
 
 
-def curve(
-    places: Sequence[Sequence[float]] | Float[np.ndarray, "place 2"],
+class Section(NamedTuple):
+    """Part of a path whose curvature changes linearly with the distance: line, arc or clothoid.
+
+    Attributes:
+        length: length [m], negative if the robot drives in reverse.
+        begin, end: curvature at both ends [1/m], positive to the left of a robot that drives ahead.
+    """
+
+    length: float
+    begin: float = 0.0
+    end: float = 0.0
+
+
+class Turn(NamedTuple):
+    """Turn on the spot by an angle [rad], positive to the left."""
+
+    angle: float
+
+
+Shape = Sequence[Section | Turn]
+"""Sections of a path in the order in which they are driven."""
+
+
+def arc(radius: float, angle: float) -> Section:
+    """Return an arc of a `radius` [m] and an `angle` [rad], positive to the left."""
+    bend = float(np.sign(angle)) / radius
+    return Section(abs(angle) * radius, bend, bend)
+
+
+def rectangle_shape(length: float = 0.9, width: float = 0.4, radius: float = 0.0) -> Shape:
+    """Return the shape of `rectangle`, driven ahead and to the right.
+
+    The `radius` [m] is that of the arcs at the corners; with 0 the robot turns on the spot there.
+    """
+    quarter = -0.5 * np.pi
+    corner = arc(radius, quarter) if radius > 0 else Turn(quarter)
+    sides = length - 2 * radius, width - 2 * radius
+    return [part for side in 2 * sides for part in (Section(side), corner)]
+
+
+def clothoid_shape(radius: float = 0.2, side: float = 0.1) -> Shape:
+    """Return the shape of a lap to the right whose curvature never jumps.
+
+    Four lines of the length `side` [m] are joined by corners, on which the curvature grows linearly
+    to that of the `radius` [m] and falls again.
+    """
+    half = 0.5 * np.pi * radius
+    return 4 * [Section(side), Section(half, 0.0, -1 / radius), Section(half, -1 / radius, 0.0)]
+
+
+def tangent(
+    shape: Shape,
     speed: float = 0.2,
     acceleration: float = 0.5,
     pause: float = 0.6,
+    yaw_rate: float = 1.6,
 ) -> Path:
-    """Return a smooth path that is driven without turning and with a stop only at its end.
+    """Return the path of a robot that does not drive sideways, from the origin, straight ahead.
+
+    The robot stops before and after a turn on the spot, where it changes between driving ahead and
+    in reverse, and at the end; in between the speed changes by a trapezoidal profile. The robot
+    drives more slowly up to the next stop where curvature times speed would exceed the yaw rate.
+    The ramps of the yaw rate of a turn last as long as those of the speed. A path without stops has
+    marks at the quarters of its length.
 
     Args:
-        places: points x, y on the curve [m]; they must be dense, since straight lines connect them.
-        speed: speed along the curve [m/s].
-        acceleration: acceleration at both ends of the curve [m/s^2].
-        pause: rest at the curve's end [s].
+        shape: sections of the path.
+        speed: largest speed [m/s].
+        acceleration: acceleration along the path [m/s^2].
+        pause: rest at every stop [s].
+        yaw_rate: largest yaw rate [rad/s].
 
     Raises:
-        ValueError: there are fewer than two points, two consecutive points are equal, or the speed
-            or the acceleration is not positive.
+        ValueError: the shape is empty or a section has no length; or the speed, the acceleration or
+            the yaw rate is not positive.
     """
     _positive(speed, acceleration)
-    p = np.asarray(places, float)
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
-    if len(p) < 2 or np.diff(length).min() < 1e-9:
-        raise ValueError(
-            f"curve of {len(p)} points, or with equal consecutive points; expected two or more "
-            "points, each different from the previous point"
-        )
-    distance, rate = _trapezoid(float(length[-1]), speed, acceleration, pause)
-    distance, rate = np.append(0.0, distance), np.append(0.0, rate)
-    place = np.stack([np.interp(distance, length, x) for x in p.T], axis=1)
-    slope = np.stack([np.interp(distance, length, np.gradient(x, length)) for x in p.T], axis=1)
-    still = np.zeros((len(distance), 1))
-    quarters = np.searchsorted(distance, length[-1] * np.array([0.25, 0.5, 0.75]))
-    at = np.append(quarters, len(distance) - 1)
-    rows = np.hstack([place, still, rate[:, None] * slope, still])
-    return Path(jnp.asarray(rows), jnp.asarray(at * ROW_PERIOD), jnp.asarray(place[at]))
+    if not yaw_rate > 0:
+        raise ValueError(f"yaw rate {yaw_rate} rad/s; expected a positive number")
+    if not shape or not all(part[0] for part in shape):
+        raise ValueError(f"sections {list(shape)}; expected one or more, each longer than 0")
+    rows, stops = np.zeros((1, 6)), list[int]()
+    for (moves, ahead), alike in itertools.groupby(
+        shape, lambda part: (isinstance(part, Section), part[0] > 0)
+    ):
+        parts = list(alike)
+        size, sign = np.abs([part[0] for part in parts]), 1.0 if ahead else -1.0
+        # a turn is like an arc of curvature 1 without motion
+        bend = sign * np.array([part[1:] or (1.0, 1.0) for part in parts])
+        top, most = (speed, acceleration) if moves else (yaw_rate, acceleration * yaw_rate / speed)
+        top = min(top, yaw_rate / max(float(np.abs(bend).max()), 1e-9))
+        at, rate = _trapezoid(float(size.sum()), top, most, pause)
+        pose, slope = _along(at, size, bend.T, sign * moves, rows[-1, :3])
+        rows = np.concatenate([rows, np.hstack([pose, rate[:, None] * slope])])
+        stops += [len(rows) - 1] if moves else []
+    if len(stops) == 1:
+        driven = np.cumsum(np.hypot(*np.diff(rows[:, :2], axis=0).T))
+        stops = [*np.searchsorted(driven, driven[-1] * np.array([0.25, 0.5, 0.75])) + 1, *stops]
+    marks = np.array(stops, int)
+    corners = jnp.asarray(rows[marks, :2])
+    return Path(jnp.asarray(rows), jnp.asarray(marks * ROW_PERIOD), corners)
 
 
-def circle(radius: float = 0.35, speed: float = 0.2) -> Path:
-    """Return a full circle to the right, driven without turning; `radius` [m], `speed` [m/s]."""
-    return curve(_round(radius), speed)
-
-
-def eight(radius: float = 0.25, speed: float = 0.2) -> Path:
-    """Return a circle to the right, then one to the left, driven without turning.
-
-    `radius` is in [m], `speed` in [m/s].
-    """
-    right = _round(radius)
-    return curve(np.concatenate([right, right[1:] * [1.0, -1.0]]), speed)
-
-
-def turning(speed: float = 0.2) -> Path:
-    """Return the 2021 paper's rectangle with a quarter turn to the right on each side.
-
-    `speed` is in [m/s].
-    """
-    return rectangle(speed=speed, turn=-0.5 * np.pi)
-
-
-PATHS: Mapping[str, Callable[[float], Path]] = {
-    "rectangle": lambda speed: rectangle(speed=speed),
-    "circle": lambda speed: circle(speed=speed),
-    "eight": lambda speed: eight(speed=speed),
-    "turning": turning,
+SHAPES: Mapping[str, Callable[[float], Shape]] = {
+    "rectangle": lambda scale: rectangle_shape(0.9 * scale, 0.4 * scale),
+    "circle": lambda scale: [arc(0.35 * scale, -2 * np.pi)],
+    "eight": lambda scale: [arc(0.25 * scale, -2 * np.pi), arc(0.25 * scale, 2 * np.pi)],
+    "clothoid": lambda scale: clothoid_shape(0.2 * scale, 0.1 * scale),
 }
-"""Functions that return a path of `slipid trial` for a speed [m/s], keyed by the path's name."""
+"""Functions that return the shape of a path of `slipid trial` for a scale [1], keyed by the path's
+name; robots that do not drive sideways follow it by `tangent`. Every path ends where it begins."""
 
 
-def _round(radius: float) -> Float[np.ndarray, "place 2"]:
-    """Return points of a circle to the right that begins at the origin, straight ahead [m]."""
-    angle = np.linspace(0.0, 2 * np.pi, 721)
-    return radius * np.stack([np.sin(angle), np.cos(angle) - 1.0], axis=1)
+def _untwisted(name: str) -> Callable[[float, float], Path]:
+    """Return a function that returns a path of `PATHS` that is driven without turning."""
+
+    def path(speed: float, scale: float = 1.0) -> Path:
+        return tangent(SHAPES[name](scale), speed, yaw_rate=np.inf).without_turning()
+
+    return path
+
+
+PATHS: Mapping[str, Callable[..., Path]] = {
+    "rectangle": lambda speed, scale=1.0: rectangle(0.9 * scale, 0.4 * scale, speed),
+    **{name: _untwisted(name) for name in ("circle", "eight", "clothoid")},
+    "turning": lambda speed, scale=1.0: rectangle(0.9 * scale, 0.4 * scale, speed, -0.5 * np.pi),
+}
+"""Functions that return a path of `slipid trial` for a robot that drives in any direction, for a
+speed [m/s] and a scale [1], keyed by the path's name."""
+
+
+def _along(
+    at: Float[np.ndarray, " row"],
+    size: Float[np.ndarray, " part"],
+    bend: Float[np.ndarray, "2 part"],
+    ahead: float,
+    start: Float[np.ndarray, "3"],
+) -> tuple[Float[np.ndarray, "row 3"], Float[np.ndarray, "row 3"]]:
+    """Return poses [m, m, rad] and their derivatives along a path at the distances `at`.
+
+    The parts of the path have lengths `size` and a `bend`, the derivative of the heading, which
+    changes linearly from its first to its second row. The robot drives `ahead` times the distance.
+    """
+    ends, growth = np.cumsum(size), (bend[1] - bend[0]) / size
+    before = np.cumsum(size * bend.mean(axis=0)) - size * bend.mean(axis=0)
+
+    def heading(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        k = np.minimum(np.searchsorted(ends, s), len(size) - 1)
+        since = s - (ends - size)[k]
+        turned = (bend[0, k] + 0.5 * growth[k] * since) * since
+        return start[2] + before[k] + turned, bend[0, k] + growth[k] * since
+
+    # the heading is a polynomial between two knots, so that Gauss-Legendre quadrature is exact
+    knots = np.union1d(np.append(at, 0.0), ends)
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    half = 0.5 * np.diff(knots)[:, None]
+    moved = (np.exp(1j * heading(knots[:-1, None] + half * (1 + nodes))[0]) * half) @ weights
+    place = ahead * np.append(0.0, np.cumsum(moved))[np.searchsorted(knots, at)]
+    angle, slope = heading(at)
+    pose = np.stack([start[0] + place.real, start[1] + place.imag, angle], axis=1)
+    return pose, np.stack([ahead * np.cos(angle), ahead * np.sin(angle), slope], axis=1)
 
 
 def _positive(speed: float, acceleration: float) -> None:

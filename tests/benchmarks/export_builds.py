@@ -76,9 +76,8 @@ def three_floors() -> DeployedRobot:
 
 def rounds(count: int) -> trajectory.Path:
     """So many times round a circle to the right, in 11 s each."""
-    angle = np.linspace(0.0, 2 * np.pi * count, 720 * count + 1)
-    places = 0.35 * np.stack([np.sin(angle), np.cos(angle) - 1.0], axis=1)
-    return trajectory.curve(places).after_rest(1.0)
+    shape = [trajectory.arc(0.35, -2 * np.pi * count)]
+    return trajectory.tangent(shape).without_turning().after_rest(1.0)
 
 
 PATH = rounds(6)

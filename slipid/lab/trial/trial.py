@@ -99,7 +99,7 @@ class TrialOptions:
             identified floors.
         told_map: file of the map that is given to controllers with a map; None for the true one.
         controllers: names of controllers, keys of `ROWS`.
-        path: name of the path, a key of `trajectory.PATHS`.
+        path: name of the path, see `path_of`.
         speed: speed along the path [m/s].
         starts: number of starts.
         load: name of the load set-up; None for the first.

@@ -19,7 +19,7 @@ from slipid.lab.trial.controllers import ROWS, check_gains, unused_gains
 from slipid.lab.trial.published_laws import GoswamiPadhy
 from slipid.lab.trial.summary import TrialRun, best_controllers, columns, summaries
 from slipid.lab.trial.trial import SitePlant, drawn_robot, refuse_unknown_to_site
-from slipid.model.geometry import mecanum, omni
+from slipid.model.geometry import differential, mecanum, omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot import trajectory as reference
@@ -46,123 +46,6 @@ def deployed():
     return deploy_known(robot, highest_speed=7.5)
 
 
-def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
-    path = reference.rectangle()
-    rows = np.asarray(path.rows)
-    length = np.hypot(*np.diff(rows[:, :2], axis=0).T).sum()
-    assert length == pytest.approx(2 * (0.9 + 0.4), abs=1e-3)
-    corners = np.asarray([np.asarray(path.at(t)) for t in np.asarray(path.marks)])
-    np.testing.assert_allclose(
-        corners[:, :2], [[0.9, 0], [0.9, -0.4], [0, -0.4], [0, 0]], atol=1e-9
-    )
-    np.testing.assert_allclose(corners[:, 3:], 0.0, atol=1e-9)
-    # rates are the derivatives of places
-    np.testing.assert_allclose(
-        np.gradient(rows[:, :2], reference.ROW_PERIOD, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
-    )
-    assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
-
-
-def test_a_path_too_short_for_its_speed_is_half_acceleration_and_half_braking():
-    path = reference.waypoints([(0.0, 0.0), (0.02, 0.0)], speed=0.5, acceleration=0.5, pause=0.1)
-    place, rate = np.asarray(path.rows)[:, [0, 3]].T
-    assert rate.max() == pytest.approx(0.1, rel=1e-6)  # the root of 0.02 * 0.5
-    assert np.abs(np.diff(rate)).max() <= 0.5 * reference.ROW_PERIOD + 1e-12
-    np.testing.assert_allclose(np.diff(place)[:-1], (rate[:-1] + rate[1:])[:-1] * 0.01, atol=1e-9)
-    np.testing.assert_allclose([place[-1], rate[-1]], [0.02, 0.0], atol=1e-12)
-
-
-@pytest.mark.parametrize("name", reference.PATHS)
-@pytest.mark.parametrize("speed", [0.1, 0.2])
-def test_paths_have_the_rates_of_their_places_and_rest_where_they_began(name, speed):
-    path = reference.PATHS[name](speed)
-    rows = np.asarray(path.rows)
-    rates = np.gradient(rows[:, :3], reference.ROW_PERIOD, axis=0)
-    np.testing.assert_allclose(rates[5:-5], rows[5:-5, 3:], atol=0.02)
-    pace = np.hypot(rows[:, 3], rows[:, 4])
-    assert pace.max() == pytest.approx(speed, rel=1e-4)
-    np.testing.assert_allclose(rows[[0, -1], :2], 0.0, atol=1e-9)
-    np.testing.assert_allclose(rows[[0, -1], 3:], 0.0, atol=1e-9)
-    assert rows[-1, 2] % (2 * np.pi) == pytest.approx(0.0, abs=1e-9)
-    at = np.stack([np.asarray(path.at(t)) for t in np.asarray(path.marks)])
-    np.testing.assert_allclose(at[:, :2], path.corners, atol=1e-6)
-
-
-def test_a_circle_is_round_an_eight_goes_both_ways_round_and_one_path_turns():
-    circle = np.asarray(reference.circle(0.35).rows)[:, :2]
-    np.testing.assert_allclose(np.hypot(circle[:, 0], circle[:, 1] + 0.35), 0.35, atol=1e-4)
-    np.testing.assert_allclose(
-        reference.circle(0.35).corners,
-        [[0.35, -0.35], [0, -0.7], [-0.35, -0.35], [0, 0]],
-        atol=4e-3,
-    )
-    eight = np.asarray(reference.eight(0.25).rows)[:, :2]
-    side = np.sign(eight[:, 1].round(6))
-    np.testing.assert_allclose(
-        np.hypot(eight[:, 0], eight[:, 1] - 0.25 * side)[side != 0], 0.25, atol=1e-4
-    )
-    changes = side[side != 0]
-    assert (changes[0], changes[-1], np.count_nonzero(np.diff(changes))) == (-1, 1, 1)
-    turning = reference.turning()
-    headings = [float(turning.at(t)[2]) for t in np.asarray(turning.marks)]
-    np.testing.assert_allclose(headings, -0.5 * np.pi * np.arange(1, 5), atol=1e-9)
-    still = np.asarray(reference.rectangle().rows)[:, :2]
-    np.testing.assert_allclose(np.asarray(turning.rows)[:, :2], still, atol=1e-12)
-
-
-def test_the_remaining_length_of_a_path_ends_with_it():
-    path = reference.rectangle()
-    left = [float(path.remaining(t)) for t in (0.0, *np.asarray(path.marks), 99.0)]
-    np.testing.assert_allclose(left, [2.6, 1.7, 1.3, 0.4, 0.0, 0.0], atol=1e-6)
-
-
-def test_a_path_moved_to_a_start_has_its_shape():
-    start = (0.3, -0.2, 2.0)
-    path = reference.rectangle()
-    moved = path.moved(start)
-    c, s = np.cos(2.0), np.sin(2.0)
-    back = (np.asarray(moved.rows)[:, :2] - start[:2]) @ np.array([[c, -s], [s, c]])
-    np.testing.assert_allclose(back, np.asarray(path.rows)[:, :2], atol=1e-12)
-    assert np.asarray(moved.rows)[0, 2] == pytest.approx(2.0)
-
-
-def test_a_path_waits_for_a_robot_that_lags_and_not_for_one_that_is_ahead():
-    path = reference.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
-    now = jnp.asarray(2.0)
-    here = np.asarray(path.at(2.0))
-    on, rates = path.follow(now, jnp.asarray(here[:3]), 0.05)
-    assert float(on) == pytest.approx(2.05)
-    assert float(rates[3]) == pytest.approx(0.2)
-    far_behind = here[:3] - [0.2, 0.0, 0.0]
-    stays, rates = path.follow(now, jnp.asarray(far_behind), 0.05)
-    assert float(stays) == pytest.approx(2.0)
-    np.testing.assert_allclose(rates[3:], 0.0)
-    ahead, _ = path.follow(now, jnp.asarray(here[:3] + np.array([0.2, 0.0, 0.0])), 0.05)
-    assert float(ahead) == pytest.approx(2.05)
-
-
-def test_a_preview_is_of_the_rates_alone():
-    path = reference.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
-    now = jnp.asarray(path.duration - 0.35)  # it brakes for 0.4 s
-    _, plain = path.follow(now, path.at(now)[:3], 0.05)
-    _, early = path.follow(now, path.at(now)[:3], 0.05, 0.2)
-    np.testing.assert_array_equal(early[:3], plain[:3])
-    assert float(plain[3] - early[3]) == pytest.approx(0.5 * 0.2)
-
-
-def test_way_points_are_refused_with_the_reason():
-    with pytest.raises(ValueError, match="at least two points"):
-        reference.waypoints([(0.0, 0.0)])
-    with pytest.raises(ValueError, match="expected positive numbers"):
-        reference.rectangle(speed=-0.2)
-    with pytest.raises(ValueError, match="twice in succession"):
-        reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
-    with pytest.raises(ValueError, match="each different from the previous point"):
-        reference.curve([(0.0, 0.0), (0.0, 0.0)])
-    with pytest.raises(ValueError, match="expected positive numbers"):
-        reference.circle(speed=0.0)
-
-
 def control_loop(deployed, preview=0.0):
     gains = replace(Gains(), preview=jnp.asarray(preview))
     return ControlLoop(Odometry(deployed), Controller(deployed, gains))
@@ -181,6 +64,22 @@ def test_encoders_close_every_path_without_slip(deployed, name):
     assert found.closure_mm < 5
     assert found.cross_track_rmse_mm < 10
     assert abs(found.heading_error_deg) < 0.5
+
+
+@pytest.mark.slow
+def test_turns_on_the_spot_have_no_side(deployed):
+    sides = reference.Section(0.3), reference.Turn(np.pi), reference.Section(0.3)
+    half = reference.Turn(-np.pi)
+    for shape, expected in (([half], ()), ([*sides, half, half], (300.0, 300.0))):
+        course = closed_loop.run_closed_loop(
+            control_loop(deployed), reference.tangent(shape), Unicycle(deployed), (0.0, 0.0, 0.0)
+        )
+        found = closed_loop.path_metrics(course)
+        assert found.finished
+        assert found.sides_mm == pytest.approx(expected)
+        np.testing.assert_allclose(found.along_track_mm, np.zeros(len(expected)), atol=10)
+        assert found.closure_mm < 5
+        assert abs(found.heading_error_deg) < 1.0
 
 
 @pytest.mark.slow
@@ -233,7 +132,7 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
 @pytest.mark.slow
 def test_of_a_curve_the_first_quarter_is_judged(deployed):
     start = (0.0, 0.0, 0.0)
-    path = reference.circle(0.35)
+    path = reference.PATHS["circle"](0.2)
     course = closed_loop.run_closed_loop(
         control_loop(deployed), path, Unicycle(deployed, start, radius=0.8, track=0.8), start
     )
@@ -357,7 +256,7 @@ def test_starts_are_spread_and_the_same_for_everyone():
         middles.append((x + 0.45 * c + 0.2 * s, y + 0.45 * s - 0.2 * c))
     assert np.abs(middles).max() <= 1.2 + 1e-9
     assert np.std(middles, axis=0).min() > 0.4
-    for start in starts(20, floor, reference.eight()):  # its middle is where it begins
+    for start in starts(20, floor, reference.PATHS["eight"](0.2)):  # its middle is where it begins
         assert np.abs(start[:2]).max() <= 1.2 + 1e-3
 
 
@@ -488,11 +387,19 @@ def test_impossible_trials_are_refused(tmp_path, deployed):
     with pytest.raises(DataError, match="no controller; expected one of encoder"):
         tr._tasks(tmp_path, tr.TrialOptions(controllers=tr.controller_names(",")))
     assert tr.controller_names("contact, encoder,contact") == ("contact", "encoder")
-    with pytest.raises(DataError, match="no path 'square'; expected one of rectangle, circle"):
+    with pytest.raises(
+        DataError, match="no path 'square' for this robot; expected one of rectangle, circle"
+    ):
         path_of("square", 0.2, deployed)
     for speed in (0.0, 0.31, float("nan")):
         with pytest.raises(DataError, match=r"expected a speed above 0 and at most 0\.3 m/s"):
             path_of("circle", speed, deployed)
+    pair = deploy_known(build(differential(0.2, 0.04), ["firm"]), highest_speed=7.5)
+    with pytest.raises(DataError, match=r"'turning' for this robot; expected .*, clothoid$"):
+        path_of("turning", 0.2, pair)
+    np.testing.assert_allclose(path_of("rectangle", 0.2, pair).corners[0], [1.35, 0.0])
+    assert float(jnp.abs(path_of("rectangle", 0.2, pair).rows[:, 5]).max()) < 0.2 / 0.18
+    np.testing.assert_array_equal(path_of("circle", 0.2, deployed).rows[:, 2], 0.0)
     assert path_of("circle", 0.3, deployed).duration < path_of("circle", 0.1, deployed).duration
     with pytest.raises(DataError, match=r"robot\.json: missing; write it by `slipid identify`"):
         tr._tasks(tmp_path, tr.TrialOptions())
