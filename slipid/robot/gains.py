@@ -98,7 +98,7 @@ class DesignedGains:
         Raises:
             ValueError: the robot consists of arrays without a record.
         """
-        known = with_record(robot).record.actuators
+        known = getattr(with_record(robot).record, 'actuators', None)
         if known is None:
             return None
         actuator = Actuator(known.delay_s, known.lag_s, PERIOD)
