@@ -9,7 +9,6 @@ from slipid.deploy.floors import floor_of
 from slipid.robot import trajectory
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.limits import Limits
-from slipid.robot.robot_file import geometry_of
 from slipid.robot.trajectory import Path
 from slipid.robot.twin import ActuatorModel, Twin, TwinPlant
 from slipid.support.errors import DataError
@@ -87,29 +86,35 @@ def path_scale(robot: DeployedRobot) -> float:
 def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
     """Return the path called `name`, which begins at the origin, for a speed [m/s].
 
-    A robot that does not drive sideways gets a path whose heading is tangent to it, with turns on
-    the spot no faster than its limit of the yaw rate, at which its wheels move at about `speed`.
-    Lengths are multiplied by `path_scale`.
+    A robot that does not drive sideways gets a path whose heading is tangent to it. The rims of its
+    wheels move at about `speed` in turns on the spot. Its yaw rate stays within the robot's limit,
+    and its acceleration within half of the limit, so that the controller has the other half for
+    corrections. Lengths are multiplied by `path_scale`.
 
     Raises:
-        DataError: there is no such path for this robot, or the speed exceeds the highest rim speed
-            of the fitted runs.
+        DataError: there is no such path for this robot, or the speed exceeds the robot's limit or
+            the highest rim speed of the fitted runs.
     """
-    holonomic = geometry_of(robot.record).determines_twist
-    paths = trajectory.PATHS if holonomic else trajectory.SHAPES
+    paths = trajectory.PATHS if robot.holonomic else trajectory.SHAPES
     if name not in paths:
         raise DataError(f"no path '{name}' for this robot; expected one of {', '.join(paths)}")
-    most = float(robot.highest[0] * robot.frame.radius)
+    limits, scale = Limits.of(robot), path_scale(robot)
+    most, reason = min(
+        (float(robot.highest[0] * robot.frame.radius), "highest rim speed of the fitted runs"),
+        (float(limits.speed), "robot's limit"),
+    )
     if not 0 < speed <= most:
         raise DataError(
             f"speed {speed:g} m/s; expected a speed above 0 and at most {most:.2g} m/s, the "
-            "highest rim speed of the fitted runs"
+            f"{reason}"
         )
-    scale = path_scale(robot)
-    if holonomic:
+    if robot.holonomic:
         return trajectory.PATHS[name](speed, scale)
-    yaw_rate = min(speed / (scale * trajectory.BASE_M), float(Limits.of(robot).yaw_rate))
-    return trajectory.tangent(trajectory.SHAPES[name](scale), speed, yaw_rate=yaw_rate)
+    yaw_rate = min(speed / (scale * trajectory.BASE_M), float(limits.yaw_rate))
+    acceleration = min(0.5, 0.5 * float(limits.acceleration))
+    return trajectory.tangent(
+        trajectory.SHAPES[name](scale), speed, acceleration, yaw_rate=yaw_rate
+    )
 
 
 def twin_plant(

@@ -81,13 +81,31 @@ class ControlLoop(eqx.Module, Generic[State]):
         """Return the next state, and the output: command, estimate and time of the path."""
         dt = jnp.asarray(dt, dtype=float)
         estimator, estimate = self.estimator.step(state.estimator, measurement, dt)
-        # an invalid pose counts as far from the path, which then waits
-        here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
-        time, reference = path.follow(state.time, here, dt, self.controller.gains.preview)
+        time, reference = self.controller.follow(path, state.time, estimate.pose, dt)
         controller, command = self.controller.step(state.controller, reference, estimate, dt)
         flags = controller.drives_off, controller.gave_up
         output = ControlLoopOutput(command, estimate, time, *flags)
         return ControlLoopState(estimator, controller, time), output
+
+    def drive(
+        self,
+        twist: Float[Numbers, "3"],
+        state: ControlLoopState[State],
+        measurement: Measurement | Readings,
+        dt: Float[Numbers, ""] | float,
+    ) -> tuple[ControlLoopState[State], ControlLoopOutput]:
+        """Return the next state and the output for a demanded twist instead of a path.
+
+        `twist` is a velocity in the body frame [m/s, m/s, rad/s], such as a `cmd_vel` of ROS. The
+        wheel speeds compensate the slip that is expected on the floors under the wheels.
+        """
+        dt = jnp.asarray(dt, dtype=float)
+        estimator, estimate = self.estimator.step(state.estimator, measurement, dt)
+        asked = jnp.asarray(twist, dtype=float)
+        controller, command = self.controller.drive(state.controller, asked, estimate, dt)
+        flags = controller.drives_off, controller.gave_up
+        output = ControlLoopOutput(command, estimate, state.time, *flags)
+        return ControlLoopState(estimator, controller, state.time), output
 
 
 @runtime_checkable

@@ -45,6 +45,7 @@ from slipid.robot.supervision import (
     recovery_factors,
     supervised,
 )
+from slipid.robot.trajectory import Path
 
 NO_CONTROLLER = (
     "this robot turns by steered wheels: it has an estimator (slipid.Estimator), but no "
@@ -61,6 +62,9 @@ OBSERVER_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LARGEST_INTEGRAL = 0.06
 """Largest velocity that the integral term may add to each component [m/s]."""
+HEADING_ARM_M = 0.2
+"""Lever at which a heading that lags behind the path counts as a distance that lags, for robots
+that cannot drive sideways [m]."""
 RESPONSE_S = 0.15
 """Delay and lag of wheels whose actuators are unknown [s]."""
 BESIDE_M, BESIDE_SPEED = (0.03, 0.08), 0.05
@@ -164,6 +168,21 @@ class Controller(eqx.Module):
     def rearmed(self, state: ControllerState) -> ControllerState:
         """Return the state of a robot that gave up and is allowed to drive again."""
         return state.rearmed()
+
+    def follow(
+        self,
+        path: Path,
+        time: Float[Array, ""],
+        pose: Float[Array, "3"],
+        dt: Float[Array, ""] | float,
+    ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
+        """Return the time of a path one step later, and the reference for `step`.
+
+        The path waits for a robot that lags, see `Path.follow`; an invalid pose counts as far away.
+        """
+        here = jnp.where(jnp.isfinite(pose), pose, 1e3)
+        arm = 0.0 if self.robot.holonomic else HEADING_ARM_M
+        return path.follow(time, here, dt, self.gains.preview, arm)
 
     def step(
         self,

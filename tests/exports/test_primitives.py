@@ -17,6 +17,7 @@ from slipid.exports.c99.function import Argument, function
 from slipid.exports.c99.lower import UnsupportedError
 from slipid.exports.c99.text import table
 from slipid.exports.text import template
+from slipid.robot.trajectory import SHAPES, tangent
 from tests.helpers import small_twin
 from tests.helpers.compiled_c import NEEDS_COMPILER, QUICK
 
@@ -61,6 +62,16 @@ def _kept_in_branches(x):
         return jax.lax.cond(jnp.sum(c) > 0.2, one, other)
 
     return jax.lax.fori_loop(0, 4, turn, x) + q
+
+
+LAP = tangent(SHAPES["clothoid"](1.0))
+
+
+def _followed(x, y):
+    """A path at some time, beside which a robot stands that has turned."""
+    time = 5 * jnp.abs(y[0])
+    beside = 0.03 * x * jnp.array([1.0, 1.0, 8.0])
+    return LAP.follow(time, LAP.at(time)[:3] + beside, 0.05, 0.2, 0.2)
 
 
 def _swapped(x, y):
@@ -214,6 +225,7 @@ FUNCTIONS = {
         WIDE,
         SMALL,
     ),
+    "a path that waits": (_followed, SMALL, SMALL),
     "several times": (_loop, SQUARE),
     "one or the other": (_branch, SMALL, SQUARE, SQUARE),
 }

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 
 from slipid.exports.c99.builder import Names
 from slipid.exports.c99.function import Argument, Function, function
@@ -67,9 +66,7 @@ class Code:
             return loop.init(pose).estimator, loop.init(pose).controller
 
         def follow(time: jax.Array, pose: jax.Array, dt: jax.Array) -> object:
-            # an invalid pose counts as far from the path, which then waits
-            here = jnp.where(jnp.isfinite(pose), pose, 1e3)
-            return path.follow(time, here, dt, loop.controller.gains.preview)
+            return loop.controller.follow(path, time, pose, dt)
 
         step = controller.changed, reference, estimate, dt, command
         for name, run, arguments in (

@@ -66,6 +66,27 @@ def test_encoders_close_every_path_without_slip(deployed, name):
     assert abs(found.heading_error_deg) < 0.5
 
 
+@pytest.fixture(scope="module")
+def pair():
+    """A robot with two wheels."""
+    return deploy_known(build(differential(0.2, 0.04), ["firm"]), highest_speed=20.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", reference.SHAPES)
+@pytest.mark.parametrize("beside", [(0.0, 0.0, 0.0), (0.0, -0.1, 1.5)])
+def test_a_robot_that_does_not_drive_sideways_closes_its_paths(pair, name, beside):
+    path = path_of(name, 0.2, pair)
+    loop = ControlLoop(Odometry(pair), Controller(pair))
+    plant = Unicycle(pair, beside, delay_s=0.1, lag_s=0.03)
+    found = closed_loop.path_metrics(closed_loop.run_closed_loop(loop, path, plant, beside))
+    assert found.finished
+    assert found.closure_mm < 10
+    assert abs(found.heading_error_deg) < 2
+    assert found.cross_track_rmse_mm < (40 if any(beside) else 5)
+    assert np.abs(found.along_track_mm).max() < 15
+
+
 @pytest.mark.slow
 def test_turns_on_the_spot_have_no_side(deployed):
     sides = reference.Section(0.3), reference.Turn(np.pi), reference.Section(0.3)
@@ -373,7 +394,7 @@ def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
     assert drawn_robot(known, 3).floors.friction[0] == drawn_robot(known, 3).floors.friction[0]
 
 
-def test_impossible_trials_are_refused(tmp_path, deployed):
+def test_impossible_trials_are_refused(tmp_path, deployed, pair):
     with pytest.raises(DataError, match="expected testsite or twin"):
         tr._tasks(tmp_path, tr.TrialOptions(plant="moon"))
     with pytest.raises(DataError, match="no controller 'magic'; expected one of encoder"):
@@ -394,7 +415,8 @@ def test_impossible_trials_are_refused(tmp_path, deployed):
     for speed in (0.0, 0.31, float("nan")):
         with pytest.raises(DataError, match=r"expected a speed above 0 and at most 0\.3 m/s"):
             path_of("circle", speed, deployed)
-    pair = deploy_known(build(differential(0.2, 0.04), ["firm"]), highest_speed=7.5)
+    with pytest.raises(DataError, match=r"at most 0\.5 m/s, the robot's limit"):
+        path_of("circle", 0.6, pair)
     with pytest.raises(DataError, match=r"'turning' for this robot; expected .*, clothoid$"):
         path_of("turning", 0.2, pair)
     np.testing.assert_allclose(path_of("rectangle", 0.2, pair).corners[0], [1.35, 0.0])
