@@ -185,9 +185,14 @@ class _Model:
         speed, angle = aim.copy(), np.zeros((len(self.grid), *shape))
         gain = 1 - np.exp(-STEP_S / np.maximum(lag, LEAST_LAG_S))
         for k, wanted in enumerate(mean):
-            aim = aim + np.clip(wanted - aim, -slew * STEP_S, slew * STEP_S)
-            speed = speed + gain * (aim - speed)
-            angle[k + 1] = angle[k] + STEP_S * speed
+            change = np.clip(wanted - aim, -slew * STEP_S, slew * STEP_S)
+            aim = aim + change
+            # mean set-point of the step, on the way while the acceleration is limited
+            mean_aim = np.where(aim == wanted, aim, aim - 0.5 * change)
+            rise = gain * (mean_aim - speed)
+            speed = speed + rise
+            # the integral of lag w' + w = s
+            angle[k + 1] = angle[k] + STEP_S * mean_aim - np.maximum(lag, LEAST_LAG_S) * rise
         out = np.zeros((len(points), *self.measured.shape))
         for k, pair in enumerate(self.pairs):
             rows = len(pair.time) - 1
