@@ -38,6 +38,11 @@ from slipid.robot import record
 from slipid.robot.record import EffectRecord, axes_of, plain
 from slipid.support.blocks import in_blocks
 
+HEADROOM = 1.2
+"""Highest wheel speed that is allowed, over the highest one of the runs [1]."""
+MOST_YAW_RATE, ACCELERATION = 2.0, 1.0
+"""Limits of a robot about which nothing is known: yaw rate [rad/s], acceleration of the rim of a
+wheel [m/s^2]."""
 NO_LIMIT = 1e6
 """Highest current of a robot whose currents are not modelled [A]."""
 
@@ -67,21 +72,48 @@ def robot_record(
         seen: ranges that the fitted runs cover, keyed by floor; floors may be absent.
         effects: effect tables keyed by load set-up; load set-ups may be absent.
     """
+    loads = tuple(
+        _load(robot, name, highest_speed, draws, effects.get(name))
+        if robot.geometry.driven is None
+        else _without_forces(robot, name)
+        for name in robot.body.loads
+    )
     return record.RobotRecord(
         wheels=record.Wheels(
             **{f.name: getattr(robot.geometry, f.name) for f in fields(record.Wheels)}
         ),
         parameters={p: n for p, n in numbers.items() if not p.startswith("camera.")},
         floors=tuple(_floor(name, std, seen.get(name)) for name in robot.surfaces.labels),
-        loads=tuple(
-            _load(robot, name, highest_speed, draws, effects.get(name))
-            if robot.geometry.driven is None
-            else _without_forces(robot, name)
-            for name in robot.body.loads
-        ),
+        loads=loads,
         current_trend=current_trend,
         highest_speed=highest_speed,
+        limits=assumed_limits(robot, highest_speed, max(load.highest_current for load in loads)),
         draws=dict(_varied(robot, draws)),
+    )
+
+
+def assumed_limits(robot: Robot, highest_speed: float, current: float) -> record.LimitsRecord:
+    """Return limits of a robot of which only the highest wheel speed of its runs is known.
+
+    Wheels may turn faster than that by `HEADROOM`, the body as fast as it can in its slowest
+    direction, and yaw at `MOST_YAW_RATE` at most. The voltage is what the motor's model needs for
+    that wheel speed at a current [A], so that it limits nothing.
+    """
+    shape, motor = robot.geometry, robot.motor
+    frame, wheel_speed = shape.frame(), HEADROOM * highest_speed
+    forward, rim = np.abs(frame.forward()), wheel_speed * float(frame.radius)
+    # a wheel rolls fastest where the body moves along its row of `forward`
+    ahead = np.hypot(*forward[:, :2].T) if shape.determines_twist else forward[:, 0]
+    yaw_rate = min(rim / max(float(forward[:, 2].max()), 1e-9), MOST_YAW_RATE)
+    volt = float(motor.back_emf) * float(shape.gear_ratio) * wheel_speed
+    if current < NO_LIMIT:
+        volt += float(motor.resistance) * current
+    return record.LimitsRecord(
+        speed=record.Setting(rim / float(ahead.max())),
+        yaw_rate=record.Setting(yaw_rate),
+        acceleration=record.Setting(ACCELERATION),
+        wheel_speed=record.Setting(wheel_speed, "logs"),
+        voltage=record.Setting(volt),
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.robot.deployed import RobotArrays, with_record
+from slipid.robot.record import Setting
 
 Numbers = Array | np.ndarray
 Pose = Float[Numbers, "3"] | tuple[float, float, float]
@@ -87,8 +88,12 @@ class Settings(eqx.Module):
             ValueError: the robot consists of arrays without a record.
         """
         record = with_record(robot).record
+        parts = vars(record.sensors).items()
+        known = {name: part.value for name, part in parts if isinstance(part, Setting)}
         return cls(
-            current_is_signed=record.sensors.current_is_signed, further_floor_penalty=record.alike
+            current_is_signed=record.sensors.current_is_signed,
+            further_floor_penalty=record.alike,
+            **known,
         )
 
 

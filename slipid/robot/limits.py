@@ -1,8 +1,10 @@
 """Limits of the commands that a controller gives to a robot."""
 
+from dataclasses import fields
+
 import equinox as eqx
 
-from slipid.robot.deployed import RobotArrays
+from slipid.robot.deployed import RobotArrays, with_record
 from slipid.robot.interface import Scalar
 
 
@@ -25,9 +27,10 @@ class Limits(eqx.Module):
 
     @classmethod
     def of(cls, robot: RobotArrays) -> "Limits":
-        """Return the limits of a robot.
+        """Return the limits in a robot's record.
 
         Raises:
             ValueError: the robot consists of arrays without a record.
         """
-        return cls()
+        limits = with_record(robot).record.limits
+        return cls(**{f.name: getattr(limits, f.name).value for f in fields(cls)})

@@ -22,6 +22,8 @@ Axes = tuple[float, float, float]
 Source = Literal["laplace", "posterior", "given"]
 Verdict = Literal["identified", "weak", "disputed", "not_identified", "at_bound", "fixed"]
 Provenance = Literal["measured", "borrowed", "override"]
+Basis = Literal["config", "logs", "assumed"]
+"""Origin of a setting: the user's config, the logs, or nothing that belongs to the robot."""
 GainsVerdict = Literal["better than by hand", "no better than by hand", "worse than by hand"]
 UNITS = {
     "wheels.place": "base radius",
@@ -54,6 +56,18 @@ UNITS = {
     "steering.gain": "1",
     "steering.understeer": "s^2/m",
     "gains.loss": "mm",
+    "limits.speed": "m/s",
+    "limits.yaw_rate": "rad/s",
+    "limits.acceleration": "m/s^2",
+    "limits.wheel_speed": "rad/s",
+    "limits.voltage": "V",
+    "sensors.ammeter_std_a": "A",
+    "sensors.voltmeter_std_v": "V",
+    "sensors.gyro_std": "rad/s",
+    "sensors.gyro_bias_std": "rad/s",
+    "sensors.stale_s": "s",
+    "actuators.delay_s": "s",
+    "actuators.lag_s": "s",
 }
 """Units of the fields of robot.json, keyed by the field's path without indices."""
 
@@ -200,12 +214,60 @@ class LoadRecord:
 
 
 @dataclass(frozen=True)
+class Setting:
+    """A limit, or a property of a sensor or an actuator, with its origin."""
+
+    value: float
+    provenance: Basis = "assumed"
+
+
+@dataclass(frozen=True)
+class LimitsRecord:
+    """Limits of commands, see `slipid.robot.limits.Limits`."""
+
+    speed: Setting
+    yaw_rate: Setting
+    acceleration: Setting
+    wheel_speed: Setting
+    voltage: Setting
+
+
+@dataclass(frozen=True)
 class LogSensors:
-    """Sensors of the logs, on which the estimator relies by default."""
+    """Sensors of the logs, on which the estimator relies by default.
+
+    Attributes:
+        current_is_signed: True if logged currents have signs.
+        voltage: True if voltages are logged.
+        gyro: True if yaw rates of a gyro are logged.
+        ammeter_std_a: std of an ammeter's noise.
+        voltmeter_std_v: std of a voltmeter's noise.
+        gyro_std: std of the gyro's noise.
+        gyro_bias_std: std of the gyro's bias at the start.
+        stale_s: time without readings after which a wheel counts as stale.
+    """
 
     current_is_signed: bool = False
     voltage: bool = False
     gyro: bool = False
+    ammeter_std_a: Setting = Setting(0.07)
+    voltmeter_std_v: Setting = Setting(0.06)
+    gyro_std: Setting = Setting(0.004)
+    gyro_bias_std: Setting = Setting(0.01)
+    stale_s: Setting = Setting(0.3)
+
+
+@dataclass(frozen=True)
+class ActuatorRecord:
+    """Response of the wheels to commands.
+
+    Attributes:
+        delay_s: time until a command reaches the wheels; None if unknown.
+        lag_s: time constant with which the wheels then follow it; None if unknown.
+    """
+
+    delay_s: Setting | None = None
+    lag_s: Setting | None = None
 
 
 @dataclass(frozen=True)
@@ -292,7 +354,9 @@ class RobotRecord:
         current_trend: a and b of the excess a + b v of measured over modelled currents at a body
             speed v.
         highest_speed: highest wheel speed of the fitted runs.
+        limits: limits of commands.
         sensors: sensors of the logs.
+        actuators: response of the wheels to commands.
         alike: decrease of the log probability of a hypothesis for each further floor under the
             robot; it is smaller if the fit used runs over several floors.
         messages: messages for users of the parameters.
@@ -310,7 +374,9 @@ class RobotRecord:
     loads: tuple[LoadRecord, ...]
     current_trend: Pair
     highest_speed: float
+    limits: LimitsRecord
     sensors: LogSensors = LogSensors()
+    actuators: ActuatorRecord = ActuatorRecord()
     alike: float = 3.0
     messages: tuple[str, ...] = ()
     data: str | None = None

@@ -22,7 +22,16 @@ import numpy as np
 from slipid.model.geometry import Geometry
 from slipid.model.robot import build
 from slipid.parameter import Declaration, Entry, entries
-from slipid.robot.record import UNITS, EffectRecord, Numbers, RobotRecord
+from slipid.robot.record import (
+    UNITS,
+    ActuatorRecord,
+    EffectRecord,
+    LimitsRecord,
+    LogSensors,
+    Numbers,
+    RobotRecord,
+    Setting,
+)
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
@@ -110,7 +119,7 @@ def _wrong(where: str, value: object, expected: str) -> ValueError:
     return ValueError(f"{where}: {shown}; expected {expected}")
 
 
-SCHEMA = "slipid.robot/7"
+SCHEMA, BEFORE = "slipid.robot/8", "slipid.robot/7"
 REWRITE_HINT = "copy it again, or write it again with `slipid identify`"
 
 
@@ -131,18 +140,22 @@ def read_robot(path: Path) -> RobotRecord:
     """Return the record in a robot's file; raise the same errors as `DeployedRobot.load`."""
     content = _content(path)
     written, computed = content.pop("checksum", None), checksum(content)
-    content.pop("schema")
-    if content.pop("units", None) != UNITS:
+    before = content.pop("schema") == BEFORE
+    units = content.pop("units", None)
+    known = isinstance(units, dict) and units.items() <= UNITS.items() if before else units == UNITS
+    if not known:
         raise DataError(
             f"{path}: the units in this file differ from the units of {SCHEMA}; {REWRITE_HINT}"
         )
     numbers = content.pop("numbers", None)
     try:
+        if before:
+            content = _with_assumed(content)
         record: RobotRecord = typed(RobotRecord, content)
         check_record(record)
     except ValueError as error:
         raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
-    if written != computed or numbers != record.numbers:
+    if written != computed or not (before or numbers == record.numbers):
         raise DataError(
             f"{path}: the content does not match its checksum, so it was changed or damaged after "
             f"it was written; {REWRITE_HINT}"
@@ -150,8 +163,31 @@ def read_robot(path: Path) -> RobotRecord:
     return record
 
 
+def _with_assumed(content: Mapping[str, Any]) -> dict[str, object]:
+    """Return the content of a file of schema `BEFORE` as `SCHEMA` has it, with a message.
+
+    Limits, noise of sensors and actuators were not written; the values are those that every robot
+    had.
+    """
+    limits = LimitsRecord(Setting(0.5), Setting(2.0), Setting(1.0), Setting(13.0), Setting(22.0))
+    message = (
+        f"read from a file of {BEFORE}, which has no limits of the robot: speed 0.5 m/s, yaw rate "
+        "2 rad/s, acceleration 1 m/s^2, wheel speed 13 rad/s, voltage 22 V and the noise of its "
+        "sensors are assumed; write the file again with `slipid identify`"
+    )
+    found = {**content, "limits": asdict(limits), "actuators": asdict(ActuatorRecord())}
+    if isinstance(messages := content.get("messages"), list):
+        found["messages"] = [*messages, message]
+    if isinstance(sensors := content.get("sensors"), dict):
+        found["sensors"] = asdict(LogSensors()) | sensors
+    if isinstance(loads := content.get("loads"), list):
+        none = {"inverse_kinematics": None}
+        found["loads"] = [none | load if isinstance(load, dict) else load for load in loads]
+    return found
+
+
 def _content(path: Path) -> dict[str, object]:
-    """Return the JSON object in a robot's file; raise `DataError` if its schema is not `SCHEMA`."""
+    """Return the JSON object in a robot's file; raise `DataError` if its schema is not known."""
     try:
         content = json.loads(
             path.read_bytes().decode("utf-8"), parse_constant=_refused, object_pairs_hook=_once
@@ -169,7 +205,7 @@ def _content(path: Path) -> dict[str, object]:
             f"{path}: not a robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
             "that `slipid identify` writes"
         )
-    if schema != SCHEMA:
+    if schema not in (SCHEMA, BEFORE):
         newer = int(schema.partition("/")[2]) > int(SCHEMA.partition("/")[2])
         age, then = ("a newer", "update slipid") if newer else ("an older", REWRITE_HINT)
         raise DataError(
@@ -234,7 +270,20 @@ def check_record(record: RobotRecord) -> None:
                 _counted(f"loads, {load.name}: inverse_kinematics, rows of a floor", rows, drives)
         if load.told is not None:
             _check_effects(f"loads, {load.name}: told", load.told, len(record.floors))
+    _check_settings(record)
     _numbers(record)
+
+
+def _check_settings(record: RobotRecord) -> None:
+    """Raise `ValueError` for a limit, a std or a time that is not positive, or a delay below 0."""
+    for group in ("limits", "sensors", "actuators"):
+        for name, setting in vars(getattr(record, group)).items():
+            if not isinstance(setting, Setting):
+                continue
+            may_be_0 = group == "actuators"  # actuators may answer at once
+            if setting.value < 0 or (setting.value == 0 and not may_be_0):
+                expected = "0 or more" if may_be_0 else "a positive number"
+                raise ValueError(f"{group}.{name}.value: {setting.value}; expected {expected}")
 
 
 def _steered(record: RobotRecord) -> None:

@@ -208,10 +208,18 @@ def rectangle_shape(length: float = 0.9, width: float = 0.4, radius: float = 0.0
     """Return the shape of `rectangle`, driven ahead and to the right.
 
     The `radius` [m] is that of the arcs at the corners; with 0 the robot turns on the spot there.
+
+    Raises:
+        ValueError: the arcs leave nothing of a side.
     """
     quarter = -0.5 * np.pi
     corner = arc(radius, quarter) if radius > 0 else Turn(quarter)
     sides = length - 2 * radius, width - 2 * radius
+    if min(sides) <= 0:
+        raise ValueError(
+            f"arcs of radius {radius} m in a rectangle of {length} x {width} m; expected a radius "
+            f"below {0.5 * min(length, width):g} m"
+        )
     return [part for side in 2 * sides for part in (Section(side), corner)]
 
 
@@ -288,7 +296,7 @@ SHAPES: Mapping[str, Callable[[float], Shape]] = {
 name; robots that do not drive sideways follow it by `tangent`. Every path ends where it begins."""
 
 
-def _untwisted(name: str) -> Callable[[float, float], Path]:
+def _without_turning(name: str) -> Callable[[float, float], Path]:
     """Return a function that returns a path of `PATHS` that is driven without turning."""
 
     def path(speed: float, scale: float = 1.0) -> Path:
@@ -299,7 +307,7 @@ def _untwisted(name: str) -> Callable[[float, float], Path]:
 
 PATHS: Mapping[str, Callable[..., Path]] = {
     "rectangle": lambda speed, scale=1.0: rectangle(0.9 * scale, 0.4 * scale, speed),
-    **{name: _untwisted(name) for name in ("circle", "eight", "clothoid")},
+    **{name: _without_turning(name) for name in ("circle", "eight", "clothoid")},
     "turning": lambda speed, scale=1.0: rectangle(0.9 * scale, 0.4 * scale, speed, -0.5 * np.pi),
 }
 """Functions that return a path of `slipid trial` for a robot that drives in any direction, for a
@@ -327,7 +335,7 @@ def _along(
         turned = (bend[0, k] + 0.5 * growth[k] * since) * since
         return start[2] + before[k] + turned, bend[0, k] + growth[k] * since
 
-    # the heading is a polynomial between two knots, so that Gauss-Legendre quadrature is exact
+    # the curvature is linear between two knots, so that few nodes integrate to rounding errors
     knots = np.union1d(np.append(at, 0.0), ends)
     nodes, weights = np.polynomial.legendre.leggauss(5)
     half = 0.5 * np.diff(knots)[:, None]

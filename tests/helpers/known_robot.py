@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import jax
@@ -11,7 +12,20 @@ from slipid.deploy.deploy import given_numbers
 from slipid.deploy.robot_record import robot_record
 from slipid.model.robot import Robot
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.record import EffectRecord, GainRecord, GainsRecord, GainValues, Losses
+from slipid.robot.record import (
+    EffectRecord,
+    GainRecord,
+    GainsRecord,
+    GainValues,
+    LimitsRecord,
+    Losses,
+    Setting,
+)
+
+ROBOTINO = LimitsRecord(
+    *(Setting(value, "config") for value in (0.5, 2.0, 1.0, 13.0, 22.0)),
+)
+"""Limits of a Robotino; those of `slipid.robot.limits.Limits` by default."""
 
 GAINS = GainsRecord(
     values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
@@ -45,4 +59,4 @@ def deploy_known(
     record = robot_record(
         robot, given_numbers(robot), std or {}, several, highest_speed, current_trend, {}, effects
     )
-    return DeployedRobot.of(record, load)
+    return DeployedRobot.of(replace(record, limits=ROBOTINO), load)

@@ -19,12 +19,14 @@ import pytest
 
 from slipid.deploy.deploy import given_numbers
 from slipid.deploy.robot_record import robot_record
-from slipid.model.geometry import omni
+from slipid.model.geometry import differential, omni
 from slipid.model.robot import Validity, build
 from slipid.parameter import entries
 from slipid.robot.deployed import DeployedRobot, posterior_robots
 from slipid.robot.gains import Gains
-from slipid.robot.record import EffectRecord, GainValues
+from slipid.robot.interface import Settings
+from slipid.robot.limits import Limits
+from slipid.robot.record import EffectRecord, GainValues, Setting
 from slipid.support.errors import DataError
 from slipid.support.files import checksum
 from tests.helpers.known_robot import GAINS, USED, deploy_known
@@ -230,9 +232,9 @@ def test_what_is_no_robot_is_refused(tmp_path):
 
 
 def test_a_newer_file_asks_for_an_update(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/8", more=3))
+    rewritten(path, lambda c: c.update(schema="slipid.robot/9", more=3))
     said = refused(path)
-    assert "written by a newer slipid as slipid.robot/8" in said
+    assert "written by a newer slipid as slipid.robot/9" in said
     assert "update slipid" in said
 
 
@@ -241,6 +243,61 @@ def test_an_older_file_whose_law_was_another_is_to_be_written_anew(path):
     said = refused(path)
     assert "written by an older slipid as slipid.robot/2" in said
     assert "write it again with `slipid identify`" in said
+
+
+def as_schema_7(content: dict) -> None:
+    """Change the content of a file into what the version before wrote."""
+    added = ("limits.", "sensors.", "actuators.", "loads.inverse_kinematics")
+    units = {k: v for k, v in content["units"].items() if not k.startswith(added)}
+    sensors = {k: v for k, v in content["sensors"].items() if isinstance(v, bool)}
+    content.update(schema="slipid.robot/7", units=units, sensors=sensors)
+    del content["limits"], content["actuators"]
+    for load in content["loads"]:
+        del load["inverse_kinematics"]
+
+
+def test_a_file_of_the_version_before_loads_and_says_what_is_assumed(path, robot):
+    rewritten(path, as_schema_7)
+    old = DeployedRobot.load(path, "moved")
+    assert old.record.parameters == robot.record.parameters
+    assert old.record.sensors == robot.record.sensors
+    assert [load.inverse_kinematics for load in old.record.loads] == [None, None]
+    assert Limits.of(old) == Limits()
+    assert old.record.limits.voltage == Setting(22.0, "assumed")
+    assert "slipid.robot/7, which has no limits of the robot: speed 0.5" in old.record.messages[-1]
+    old.save(path)
+    assert DeployedRobot.load(path, "moved").record == old.record
+    rewritten(path, as_schema_7)
+    path.write_text(path.read_text().replace("0.003", "0.004", 1))
+    assert "does not match its checksum" in refused(path)
+
+
+def test_limits_without_logs_follow_from_the_robots_own_wheels():
+    two = build(differential(0.2, 0.1, 10.0), ["a"])
+    record = robot_record(
+        two, given_numbers(two), {}, jax.tree.map(lambda x: x[None], two), 30.0, (0.0, 0.0), {}
+    )
+    robot = DeployedRobot.of(record)
+    limits = Limits.of(robot)
+    assert limits.wheel_speed == pytest.approx(36.0)
+    assert limits.speed == pytest.approx(3.6)
+    assert limits.yaw_rate == 2.0
+    # at its limits, the wheel that a motor turns against the largest current needs this voltage
+    motor, amps = two.motor, record.loads[0].highest_current
+    volt = float(motor.back_emf) * 10.0 * 36.0 + float(motor.resistance) * amps
+    assert limits.voltage == pytest.approx(volt)
+    assert record.limits.wheel_speed.provenance == "logs"
+    assert record.limits.acceleration.provenance == "assumed"
+    slow = robot_record(
+        two, given_numbers(two), {}, jax.tree.map(lambda x: x[None], two), 3.0, (0.0, 0.0), {}
+    )
+    assert slow.limits.yaw_rate.value == pytest.approx(3.6 * 0.1 / 0.2)
+
+
+def test_settings_of_an_estimator_are_those_of_the_robots_sensors(robot):
+    sensors = replace(robot.record.sensors, gyro_std=Setting(0.02, "logs"), stale_s=Setting(1.5))
+    settings = Settings.of(DeployedRobot.of(replace(robot.record, sensors=sensors)))
+    assert (settings.gyro_std, settings.stale_s, settings.ammeter_std_a) == (0.02, 1.5, 0.07)
 
 
 def test_a_changed_digit_is_refused(path):
@@ -266,6 +323,16 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c["floors"][0].pop("effect"), "floors[0].effect is missing"),
         (lambda c: c.update(more=1), "more: no such field"),
         (lambda c: c["sensors"].update(gyro=1), "sensors.gyro: 1; expected true or false"),
+        (lambda c: c["limits"]["speed"].update(value=0), "limits.speed.value: 0.0; expected a pos"),
+        (lambda c: c["sensors"].pop("stale_s"), "sensors.stale_s is missing"),
+        (
+            lambda c: c["actuators"].update(lag_s={"value": -1, "provenance": "logs"}),
+            "actuators.lag_s.value: -1.0; expected 0 or more",
+        ),
+        (
+            lambda c: c["limits"]["voltage"].update(provenance="guess"),
+            "limits.voltage.provenance: 'guess'; expected 'config' or 'logs' or 'assumed'",
+        ),
         (lambda c: c.update(alike=True), "alike: True; expected a number"),
         (lambda c: c.update(alike=10**400), "expected a number"),
         (lambda c: c.update(source="guess"), "source: 'guess'; expected 'laplace' or 'posterior'"),
@@ -335,7 +402,7 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c["draws"].update(mass=[1]), "'mass' is not a parameter"),
         (
             lambda c: c["units"].update(alike="m"),
-            "the units in this file differ from the units of slipid.robot/7",
+            "the units in this file differ from the units of slipid.robot/8",
         ),
         (lambda c: c["gains"]["values"].pop("yaw"), "gains.values.yaw is missing"),
         (

@@ -148,6 +148,8 @@ def test_paths_are_refused_with_the_reason():
         tangent([Section(1.0)], speed=0.0)
     with pytest.raises(ValueError, match=r"yaw rate -1.0 rad/s; expected a positive number"):
         tangent([Turn(1.0)], yaw_rate=-1.0)
+    with pytest.raises(ValueError, match=r"0\.9 x 0\.4 m; expected a radius below 0\.2 m"):
+        trajectory.rectangle_shape(radius=0.2)
     for shape in ([], [Section(1.0), Turn(0.0)]):
         with pytest.raises(ValueError, match="expected one or more, each longer than 0"):
             tangent(shape)

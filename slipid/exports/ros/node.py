@@ -114,8 +114,9 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
     yield Parameter("seen.highest_speed", speed, _HIGHEST_SPEED, (zero,))
     yield Parameter("seen.highest_current", current, _HIGHEST_CURRENT, (zero,))
     yield _flat("seen.wheel_curve", robot.wheel_curve, _CURVE, _size(2 * robot.wheels))
-    for name, value in asdict(robot.record.sensors).items():
-        yield Parameter(f"seen.{name}", bool(value), f"{name}: true if the logs had this")
+    for name, value in vars(robot.record.sensors).items():
+        if isinstance(value, bool):
+            yield Parameter(f"seen.{name}", value, f"{name}: true if the logs had this")
 
 
 def _controls(robot: DeployedRobot) -> Iterator[Parameter]:

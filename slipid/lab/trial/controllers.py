@@ -41,7 +41,7 @@ def _indiveri(robot: DeployedRobot) -> Law:
         float(robot.frame.radius) * (1 + np.asarray(numbers["robot.radius_deviation"].value)),
     )
     both = jnp.stack([gains.place, gains.yaw])
-    return Indiveri(jnp.asarray(matrix), both, jnp.asarray(Limits().wheel_speed))
+    return Indiveri(jnp.asarray(matrix), both, jnp.asarray(Limits.of(robot).wheel_speed))
 
 
 @cache

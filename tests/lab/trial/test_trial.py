@@ -72,11 +72,17 @@ def pair():
     return deploy_known(build(differential(0.2, 0.04), ["firm"]), highest_speed=20.0)
 
 
+MORE = {
+    "there and back": [reference.Section(0.5), reference.Section(-0.5)],
+    "with arcs": reference.rectangle_shape(1.35, 0.6, 0.2),
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", reference.SHAPES)
+@pytest.mark.parametrize("name", [*reference.SHAPES, *MORE])
 @pytest.mark.parametrize("beside", [(0.0, 0.0, 0.0), (0.0, -0.1, 1.5)])
 def test_a_robot_that_does_not_drive_sideways_closes_its_paths(pair, name, beside):
-    path = path_of(name, 0.2, pair)
+    path = reference.tangent(MORE[name]) if name in MORE else path_of(name, 0.2, pair)
     loop = ControlLoop(Odometry(pair), Controller(pair))
     plant = Unicycle(pair, beside, delay_s=0.1, lag_s=0.03)
     found = closed_loop.path_metrics(closed_loop.run_closed_loop(loop, path, plant, beside))

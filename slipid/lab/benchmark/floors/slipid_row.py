@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.deploy.deploy import given_numbers
+from slipid.deploy.robot_record import assumed_limits
 from slipid.lab.benchmark.floors.fitting import (
     MeteredMotor,
     currents_off,
@@ -75,6 +76,7 @@ def deployed(robot: Robot) -> DeployedRobot:
         loads=(load,),
         current_trend=(0.0, 0.0),
         highest_speed=HIGHEST_SPEED,
+        limits=assumed_limits(robot, HIGHEST_SPEED, HIGHEST_A),
         draws={},
     )
     return DeployedRobot.of(record)
