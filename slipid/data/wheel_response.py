@@ -22,7 +22,6 @@ from jaxtyping import Float
 
 from slipid.data.log import Log
 from slipid.data.runs import Runs
-from slipid.data.wheel_signals import integral
 from slipid.model.geometry import Geometry
 
 STEP_S = 0.01

@@ -25,6 +25,7 @@ from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot.controller import NO_CONTROLLER
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.gains import known_actuator
 from slipid.robot.interface import MIXED_FLOORS_PENALTY
 from slipid.robot.record import (
     Axes,
@@ -40,7 +41,7 @@ from slipid.robot.record import (
     plain,
 )
 from slipid.robot.robot_file import typed
-from slipid.robot.twin import ActuatorModel
+from slipid.robot.twin import LONGEST_DELAY_S, ActuatorModel
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
@@ -277,9 +278,15 @@ def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()
 
 
 def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
-    """Return the actuator model of a robot's twin, with the sensors that the robot's logs have."""
-    sensors = robot.record.sensors
-    return ActuatorModel(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
+    """Return the actuator model of a robot's twin, with the sensors that the robot's logs have.
+
+    Delay and lag are those of the robot if they are known; the twin's delay has an upper limit.
+    """
+    sensors, known = robot.record.sensors, known_actuator(robot)
+    model = ActuatorModel(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
+    if known is None:
+        return model
+    return replace(model, delay_s=min(known.delay_s, LONGEST_DELAY_S), lag_s=known.lag_s)
 
 
 def _number(e: Estimate) -> RecordedNumber:

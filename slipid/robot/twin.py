@@ -34,8 +34,9 @@ from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import PERIOD, Measurement, Pose, Readings
 
 KEPT_COMMANDS = 6
-"""Number of commands that are kept, including the newest; the delay is at most `KEPT_COMMANDS` - 1
-periods."""
+"""Number of commands that are kept, including the newest."""
+LONGEST_DELAY_S = (KEPT_COMMANDS - 1) * PERIOD
+"""Longest delay of a twin [s]."""
 
 
 @dataclass(frozen=True)
@@ -144,11 +145,11 @@ class Twin(eqx.Module):
     actuators: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
-        """Raise `ValueError` for a delay below 0 or longer than the time of the kept commands."""
-        most = (KEPT_COMMANDS - 1) * PERIOD
-        if not 0 <= self.actuators.delay_s <= most:
+        """Raise `ValueError` for a delay below 0 or above `LONGEST_DELAY_S`."""
+        if not 0 <= self.actuators.delay_s <= LONGEST_DELAY_S:
             raise ValueError(
-                f"delay_s = {self.actuators.delay_s}; expected a delay from 0 to {most:g} s"
+                f"delay_s = {self.actuators.delay_s}; expected a delay from 0 to "
+                f"{LONGEST_DELAY_S:g} s"
             )
 
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:

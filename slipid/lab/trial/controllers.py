@@ -118,12 +118,11 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if tuned is None:
         return ""
     if tuned.load != robot.load_setup:
-        return f"gains were tuned for load set-up {tuned.load}: driving with hand-set gains"
+        return f"gains were tuned for load set-up {tuned.load}: they are not used"
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
-            f"{tuned.loss.hand:.1f} mm): driving with gains set by hand; use --tuned-gains for "
-            "the tuned gains"
+            f"{tuned.loss.hand:.1f} mm) and not used; use --tuned-gains for the tuned gains"
         )
     if tuned.values.ahead.value == 0.0:
         return ""
