@@ -40,7 +40,9 @@ class RobotCalibration:
     def deploy(self) -> DeployedRobot:
         """Return the robot for an estimator."""
         task, models = self.result.task, self.result.models
-        return calibrated_robot(self.calibration, task.robot, models, task.dataset)
+        return calibrated_robot(
+            self.calibration, task.robot, models, task.dataset, task.robot_settings
+        )
 
     def __str__(self) -> str:
         def show(page: Page, found: CalibrationResult) -> None:

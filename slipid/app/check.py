@@ -9,12 +9,14 @@ from typing import TypeVar
 import numpy as np
 
 from slipid.app.calibrate import calibrated, remarks
-from slipid.app.config import read_config
+from slipid.app.config import SETTINGS, read_config
 from slipid.app.logs import layout_of
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
 from slipid.data.check.findings import NOT_CALIBRATED, Finding, worst_first
+from slipid.data.check.own_settings import gaps, own_settings
 from slipid.data.check.sanity import findings
+from slipid.data.log import Log
 from slipid.data.runs import Runs, channels
 from slipid.fitting.calibration.estimate import evenly
 from slipid.fitting.problem import CREEPS, Problem
@@ -22,6 +24,7 @@ from slipid.fitting.variances import Search
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
+from slipid.model.geometry import Geometry
 from slipid.predict.agreement import scatter
 from slipid.predict.selection import selected
 from slipid.search_space import Space
@@ -251,11 +254,24 @@ def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
             for (surface, load, session), runs in sorted(groups.items())
         ],
         "channels": channels(data.logs),
+        **_shown_settings(data.logs, task.robot.geometry),
         "clocks": {log.name: _clock(log.pose_clock) for log in data.logs if log.pose_clock},
         "notes": dict(notes.most_common()),
         "skipped": list(skipped),
         "data": {"hash": task.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
     }
+
+
+def _shown_settings(logs: Sequence[Log], shape: Geometry) -> Content:
+    """Return the part of check.json with limits and noise that logs show, keyed as in a config."""
+    found = own_settings(logs, shape)
+    tables: dict[str, dict[str, float]] = {}
+    for key, path in SETTINGS.items():
+        if path in found:
+            group, _, name = key.partition(".")
+            tables.setdefault(group, {})[name] = found[path]
+    usual, longest = gaps(logs)
+    return {"settings": tables, "gaps_s": {"usual": usual, "longest": longest}}
 
 
 def _clock(clock: Clock) -> Content:

@@ -22,6 +22,58 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 Numbers = Number | list[Number]
 
 
+class LimitsSection(Section):
+    """Limits of the commands of a controller, in a table `[robot.limits]`.
+
+    A limit that is not given is the highest value in the logs; `slipid check` prints it.
+
+    Attributes:
+        speed_m_s: largest translational speed that is demanded of the body.
+        yaw_rate_rad_s: largest yaw rate that is demanded of the body.
+        acceleration_m_s2: largest acceleration of the rim of a wheel.
+        wheel_speed_rad_s: largest speed of a wheel.
+        voltage_v: voltage of the supply.
+    """
+
+    speed_m_s: Annotated[float, Field(gt=0, le=50)] | None = None
+    yaw_rate_rad_s: Annotated[float, Field(gt=0, le=50)] | None = None
+    acceleration_m_s2: Annotated[float, Field(gt=0, le=100)] | None = None
+    wheel_speed_rad_s: Annotated[float, Field(gt=0, le=1000)] | None = None
+    voltage_v: Annotated[float, Field(gt=0, le=1000)] | None = None
+
+
+class SensorsSection(Section):
+    """Noise of the robot's sensors, in a table `[robot.sensors]`.
+
+    What is not given is taken from the logs while the wheels rest; `slipid check` prints it.
+
+    Attributes:
+        ammeter_std_a: standard deviation of the noise of a motor's current.
+        voltmeter_std_v: standard deviation of the noise of a motor's voltage.
+        gyro_std_rad_s: standard deviation of the noise of the gyro.
+        gyro_bias_std_rad_s: standard deviation of the gyro's bias when the robot starts.
+        stale_s: time without readings after which the estimator calls a wheel stale.
+    """
+
+    ammeter_std_a: Annotated[float, Field(gt=0, le=100)] | None = None
+    voltmeter_std_v: Annotated[float, Field(gt=0, le=100)] | None = None
+    gyro_std_rad_s: Annotated[float, Field(gt=0, le=10)] | None = None
+    gyro_bias_std_rad_s: Annotated[float, Field(gt=0, le=10)] | None = None
+    stale_s: Annotated[float, Field(gt=0, le=60)] | None = None
+
+
+class ActuatorsSection(Section):
+    """Response of the wheels to commands, in a table `[robot.actuators]`.
+
+    Attributes:
+        delay_s: time until a command reaches the wheels.
+        lag_s: time constant with which the wheels then follow the command.
+    """
+
+    delay_s: Annotated[float, Field(ge=0, le=5)] | None = None
+    lag_s: Annotated[float, Field(ge=0, le=5)] | None = None
+
+
 class WheeledDrive(Section):
     """Keys that every robot on wheels has.
 
@@ -34,6 +86,9 @@ class WheeledDrive(Section):
             drives both left wheels and one both right wheels. By default, each wheel has a motor.
         motor: result of `slipid identify` or `slipid motor` for the robot's motor on a test bench;
             its path is relative to the config.
+        limits: limits of the commands of a controller.
+        sensors: noise of the robot's sensors.
+        actuators: response of the wheels to commands.
     """
 
     wheel_radius_m: Positive
@@ -41,6 +96,9 @@ class WheeledDrive(Section):
     mass_kg: Positive | None = None
     drives: list[Annotated[list[int], Field(min_length=1)]] | None = None
     motor: str | None = None
+    limits: LimitsSection = LimitsSection()
+    sensors: SensorsSection = SensorsSection()
+    actuators: ActuatorsSection = ActuatorsSection()
 
     def drive_of(self, wheels: int) -> tuple[int, ...]:
         """Return the index of each wheel's drive, or an empty tuple if no wheels share a drive."""
@@ -434,6 +492,30 @@ def read_config(path: Path) -> Config:
 def parsed(path: Path, text: str) -> Config:
     """Return the config in TOML text; raise `DataError` that lists all mistakes, one per line."""
     return Config(path, text, checked(path, mapping_of(path, text), ConfigContent))
+
+
+SETTINGS = {
+    "limits.speed_m_s": "limits.speed",
+    "limits.yaw_rate_rad_s": "limits.yaw_rate",
+    "limits.acceleration_m_s2": "limits.acceleration",
+    "limits.wheel_speed_rad_s": "limits.wheel_speed",
+    "limits.voltage_v": "limits.voltage",
+    "sensors.ammeter_std_a": "sensors.ammeter_std_a",
+    "sensors.voltmeter_std_v": "sensors.voltmeter_std_v",
+    "sensors.gyro_std_rad_s": "sensors.gyro_std",
+    "sensors.gyro_bias_std_rad_s": "sensors.gyro_bias_std",
+    "sensors.stale_s": "sensors.stale_s",
+    "actuators.delay_s": "actuators.delay_s",
+    "actuators.lag_s": "actuators.lag_s",
+}
+"""Path in robot.json of each key in the tables `[robot.limits]`, `[robot.sensors]` and
+`[robot.actuators]`."""
+
+
+def given_settings(robot: Wheels) -> dict[str, float]:
+    """Return the limits, noise and delays in a `[robot]` section, keyed by path in robot.json."""
+    given = {key: getattr(getattr(robot, key.split(".")[0]), key.split(".")[1]) for key in SETTINGS}
+    return {SETTINGS[key]: value for key, value in given.items() if value is not None}
 
 
 def geometry(robot: Wheels) -> Geometry:

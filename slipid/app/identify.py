@@ -295,6 +295,7 @@ def summarised(
         calibration=kinematic.calibration,
         selection=selection,
         suspects=remarks(kinematic, selection, task),
+        robot_settings=task.robot_settings,
     )
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)

@@ -23,11 +23,13 @@ from slipid.app.config import (
     LogsSection,
     WeightsSection,
     geometry,
+    given_settings,
     single_floor_sections,
 )
 from slipid.app.logs import files_of, read_dataset
 from slipid.data.align.lag import pose_lag
 from slipid.data.check.columns import refuse_misordered
+from slipid.data.check.own_settings import own_settings
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
@@ -163,6 +165,12 @@ class FitTask:
         """Return the hash of the names and files of all runs."""
         return hash_of((log.name, log.sha256) for log in self.logs)
 
+    @property
+    def robot_settings(self) -> dict[str, tuple[float, str]]:
+        """Limits and noise of sensors that the logs show, see `Fit.robot_settings`."""
+        shown = own_settings(self.logs, self.robot.geometry)
+        return {path: (value, "logs") for path, value in shown.items()}
+
     def problem(self, near: Robot | None = None) -> Problem:
         """Return the likelihood of the runs that stay on one floor each.
 
@@ -210,6 +218,12 @@ class ConfigFitTask(FitTask):
 
     config: Config
     skipped: tuple[str, ...]
+
+    @property
+    def robot_settings(self) -> dict[str, tuple[float, str]]:
+        """Limits, noise and delays that the config gives, and those that only the logs show."""
+        given = given_settings(self.config.content.wheels)
+        return super().robot_settings | {path: (v, "config") for path, v in given.items()}
 
 
 NO_BALANCE = (

@@ -85,7 +85,10 @@ def calibration(
     from slipid.deploy.deploy import ROBOT, calibrated_robot
 
     done = calibrate_only(task, data, out, report)
-    calibrated_robot(done.calibration, task.robot, done.models, task.dataset).save(out / ROBOT)
+    robot = calibrated_robot(
+        done.calibration, task.robot, done.models, task.dataset, task.robot_settings
+    )
+    robot.save(out / ROBOT)
     return replace(done, written=(*done.written, ROBOT))
 
 

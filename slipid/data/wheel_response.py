@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
 
 STEP_S = 0.01
@@ -75,14 +74,16 @@ class WheelResponse:
     unexplained: float
 
 
-def wheel_response(data: Runs, shape: Geometry) -> WheelResponse | None:
+def wheel_response(logs: Sequence[Log], shape: Geometry) -> WheelResponse | None:
     """Return the response of the wheels; None if the logs lack commands or do not determine it.
 
     `shape` is the geometry by which a commanded twist becomes wheel speeds.
     """
-    some = np.unique(np.linspace(0, len(data) - 1, MOST_RUNS).round().astype(int)).tolist()
+    if len(logs) < LEAST_RUNS:
+        return None
+    some = np.unique(np.linspace(0, len(logs) - 1, MOST_RUNS).round().astype(int)).tolist()
     matrix, radius = np.asarray(shape.forward()), float(shape.wheel_radius)
-    pairs = [_pair(data.logs[k], matrix / radius) for k in some]
+    pairs = [_pair(logs[k], matrix / radius) for k in some]
     kept = [pair for pair in pairs if pair is not None]
     if len(kept) < LEAST_RUNS:
         return None
@@ -146,8 +147,10 @@ class _Model:
     """Modelled speeds of several runs at once, on a common grid of times.
 
     Attributes:
-        grid: times of the grid from the first row on [s].
-        commanded: function values of the integral of each command at `knots`.
+        pairs: commands and angles of the runs.
+        grid: times of the model's steps from the first row on [s].
+        start: wheel speeds before the first row [rad/s].
+        measured: mean wheel speeds between rows [rad/s]; 0 after the end of a run.
     """
 
     pairs: Sequence[_Pair]

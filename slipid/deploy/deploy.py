@@ -35,6 +35,7 @@ from slipid.robot.record import (
     Pair,
     RecordedNumber,
     RobotRecord,
+    Setting,
     Source,
     SteeringRecord,
     axes_of,
@@ -76,6 +77,7 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
         max(max(v.wheel_speed) for v in fit.validity.values()),
         fit.current_trend,
         fit.validity,
+        fit.robot_settings,
     )
     # a robot that was fitted to runs over several floors is expected to drive across edges, so use
     # the smaller penalty for several floors under it
@@ -87,7 +89,12 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
         replace(
             record,
             source=source,
-            sensors=LogSensors(current_is_signed=fit.channels.signed, voltage=fit.channels.voltage),
+            sensors=replace(
+                record.sensors,
+                current_is_signed=fit.channels.signed,
+                voltage=fit.channels.voltage,
+                gyro=fit.channels.gyro,
+            ),
             alike=alike,
             messages=found.messages,
             data=fit.data_hash,
@@ -159,7 +166,11 @@ def _without_effects(
 
 
 def calibrated_robot(
-    found: Calibration, robot: Robot, models: Mapping[str, str], data: Runs
+    found: Calibration,
+    robot: Robot,
+    models: Mapping[str, str],
+    data: Runs,
+    settings: Mapping[str, tuple[float, str]] = MappingProxyType({}),
 ) -> DeployedRobot:
     """Return the robot of a calibration alone, with a force balance at its start values.
 
@@ -170,6 +181,7 @@ def calibrated_robot(
         robot: robot with the lengths of the config, and the floors and loads of the runs.
         models: name of the selected kinematic model, keyed by floor.
         data: the calibrated runs.
+        settings: known limits, noise of sensors and delays, see `Fit.robot_settings`.
     """
     shape = with_lengths(robot.geometry, found.nominal_radius, found.nominal_base)
     speed = max(
@@ -178,12 +190,20 @@ def calibrated_robot(
         if len(angle := log.wheel_angle) > 2
     )
     draws = jax.tree.map(lambda leaf: np.stack([np.asarray(leaf)] * 2), robot)
-    record = robot_record(robot, given_numbers(robot), {}, draws, speed, (0.0, 0.0), {})
+    known = _settings(settings)
+    record = robot_record(
+        robot, given_numbers(robot), {}, draws, speed, (0.0, 0.0), {}, settings=known
+    )
     signed = data.current_is_signed and data.current is not None
     return DeployedRobot.of(
         replace(
             with_kinematics(record, found, shape, models),
-            sensors=LogSensors(current_is_signed=signed, voltage=data.voltage is not None),
+            sensors=replace(
+                record.sensors,
+                current_is_signed=signed,
+                voltage=data.voltage is not None,
+                gyro=all(log.gyro is not None for log in data.logs),
+            ),
             messages=("calibrated kinematics alone: no force balance was fitted",),
             data=hash_of((log.name, log.sha256) for log in data.logs),
             versions=versions(),
@@ -225,6 +245,7 @@ def _record(
     highest_speed: float,
     current_trend: Pair,
     seen: Mapping[str, Validity] = MappingProxyType({}),
+    settings: Mapping[str, tuple[float, str]] = MappingProxyType({}),
 ) -> RobotRecord:
     """Return the record of a robot.
 
@@ -240,7 +261,15 @@ def _record(
         current_trend,
         seen,
         effects_by_load(contact, center, vectors),
+        _settings(settings),
     )
+
+
+def _settings(given: Mapping[str, tuple[float, str]]) -> dict[str, Setting]:
+    """Return pairs of value and origin as settings of a record."""
+    return {
+        path: typed(Setting, {"value": v, "provenance": o}, path) for path, (v, o) in given.items()
+    }
 
 
 def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:

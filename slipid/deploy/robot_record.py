@@ -16,8 +16,9 @@ with the parameters and compensates for them.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import MappingProxyType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -56,6 +57,7 @@ def robot_record(
     current_trend: record.Pair,
     seen: Mapping[str, Validity],
     effects: Mapping[str, EffectRecord] = MappingProxyType({}),
+    settings: Mapping[str, record.Setting] = MappingProxyType({}),
 ) -> record.RobotRecord:
     """Return the record of a robot, with default values of the fields about the record's origin.
 
@@ -71,6 +73,7 @@ def robot_record(
             at a body speed v.
         seen: ranges that the fitted runs cover, keyed by floor; floors may be absent.
         effects: effect tables keyed by load set-up; load set-ups may be absent.
+        settings: known limits, noise of sensors and delays, keyed by path such as `limits.speed`.
     """
     loads = tuple(
         _load(robot, name, highest_speed, draws, effects.get(name))
@@ -87,32 +90,51 @@ def robot_record(
         loads=loads,
         current_trend=current_trend,
         highest_speed=highest_speed,
-        limits=assumed_limits(robot, highest_speed, max(load.highest_current for load in loads)),
+        limits=replace(
+            assumed_limits(
+                robot,
+                settings.get(
+                    "limits.wheel_speed", record.Setting(HEADROOM * highest_speed, "logs")
+                ),
+                max(load.highest_current for load in loads),
+            ),
+            **_known(settings, "limits"),
+        ),
+        sensors=record.LogSensors(**_known(settings, "sensors")),
+        actuators=record.ActuatorRecord(**_known(settings, "actuators")),
         draws=dict(_varied(robot, draws)),
     )
 
 
-def assumed_limits(robot: Robot, highest_speed: float, current: float) -> record.LimitsRecord:
-    """Return limits of a robot of which only the highest wheel speed of its runs is known.
+def _known(settings: Mapping[str, record.Setting], group: str) -> dict[str, Any]:
+    """Return the settings of a group, keyed by name."""
+    start = f"{group}."
+    return {path.removeprefix(start): s for path, s in settings.items() if path.startswith(start)}
 
-    Wheels may turn faster than that by `HEADROOM`, the body as fast as it can in its slowest
-    direction, and yaw at `MOST_YAW_RATE` at most. The voltage is what the motor's model needs for
-    that wheel speed at a current [A], so that it limits nothing.
+
+def assumed_limits(
+    robot: Robot, wheel_speed: record.Setting, current: float
+) -> record.LimitsRecord:
+    """Return limits of a robot of which only the highest wheel speed [rad/s] is known.
+
+    The body may move as fast as the wheels allow in its slowest direction, and yaw at
+    `MOST_YAW_RATE` at most. The voltage is what the motor's model needs for that wheel speed at a
+    current [A], so that it limits nothing.
     """
     shape, motor = robot.geometry, robot.motor
-    frame, wheel_speed = shape.frame(), HEADROOM * highest_speed
-    forward, rim = np.abs(frame.forward()), wheel_speed * float(frame.radius)
+    frame, top = shape.frame(), wheel_speed.value
+    forward, rim = np.abs(frame.forward()), top * float(frame.radius)
     # a wheel rolls fastest where the body moves along its row of `forward`
     ahead = np.hypot(*forward[:, :2].T) if shape.determines_twist else forward[:, 0]
     yaw_rate = min(rim / max(float(forward[:, 2].max()), 1e-9), MOST_YAW_RATE)
-    volt = float(motor.back_emf) * float(shape.gear_ratio) * wheel_speed
+    volt = float(motor.back_emf) * float(shape.gear_ratio) * top
     if current < NO_LIMIT:
         volt += float(motor.resistance) * current
     return record.LimitsRecord(
         speed=record.Setting(rim / float(ahead.max())),
         yaw_rate=record.Setting(yaw_rate),
         acceleration=record.Setting(ACCELERATION),
-        wheel_speed=record.Setting(wheel_speed, "logs"),
+        wheel_speed=wheel_speed,
         voltage=record.Setting(volt),
     )
 

@@ -10,7 +10,7 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -18,8 +18,7 @@ import numpy as np
 from slipid.exports.text import filled, interval, listed, one_line, short, table, wrapped
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.gains import DesignedGains, Gains, used_gains
-from slipid.robot.limits import Limits
-from slipid.robot.record import Pair, Provenance, Source, Verdict
+from slipid.robot.record import UNITS, Basis, Pair, Provenance, Setting, Source, Verdict
 from slipid.robot.robot_file import declared_numbers
 
 VERDICTS: Mapping[Verdict, str] = {
@@ -102,23 +101,59 @@ def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
             yield NumberRow(group, e.path, entry, *about, *sure)
 
 
-LIMITS: Mapping[str, tuple[str, str]] = {
-    "speed": ("m/s", "largest translational speed demanded of the body"),
-    "yaw_rate": ("rad/s", "largest yaw rate demanded of the body"),
-    "acceleration": ("m/s^2", "largest acceleration of the rim of a wheel"),
-    "wheel_speed": ("rad/s", "largest speed of a wheel"),
-    "voltage": ("V", "supply voltage"),
+SETTINGS: Mapping[str, str] = {
+    "limits.speed": "largest translational speed demanded of the body",
+    "limits.yaw_rate": "largest yaw rate demanded of the body",
+    "limits.acceleration": "largest acceleration of the rim of a wheel",
+    "limits.wheel_speed": "largest speed of a wheel",
+    "limits.voltage": "supply voltage",
+    "sensors.ammeter_std_a": "std of an ammeter's noise",
+    "sensors.voltmeter_std_v": "std of a voltmeter's noise",
+    "sensors.gyro_std": "std of the gyro's noise",
+    "sensors.gyro_bias_std": "std of the gyro's bias at the start",
+    "sensors.stale_s": "time without readings after which a wheel counts as stale",
+    "actuators.delay_s": "time until a command reaches the wheels",
+    "actuators.lag_s": "time constant with which the wheels then follow a command",
 }
-"""Unit and meaning of every field of `slipid.robot.limits.Limits`."""
+"""Meaning of each limit, of the noise of each sensor, and so on, keyed by its path in robot.json;
+`UNITS` has the units."""
+BASES: Mapping[Basis, tuple[str, str]] = {
+    "config": ("given", "config"),
+    "logs": ("measured", "logs of the fitted runs"),
+    "assumed": ("ASSUMED", "neither config nor logs: enter your own value"),
+}
+"""Verdict and provenance of a setting with each origin, as text for people."""
+
+
+def settings(robot: DeployedRobot) -> dict[str, Setting]:
+    """Return the known limits, noise of sensors and response of actuators, keyed by path."""
+    record = robot.record
+    return {
+        path: one
+        for path in SETTINGS
+        if (one := getattr(getattr(record, path.split(".")[0]), path.split(".")[1])) is not None
+    }
+
+
+def settings_origin(robot: DeployedRobot) -> str:
+    """Return sentences about the origin of a robot's limits and of the noise of its sensors."""
+    known = settings(robot)
+    words = {"config": "From the config", "logs": "From the logs", "assumed": "ASSUMED"}
+    parts = []
+    for basis, word in words.items():
+        if paths := [path for path, one in known.items() if one.provenance == basis]:
+            parts.append(f"{word}: {', '.join(paths)}.")
+    if any(one.provenance == "assumed" for one in known.values()):
+        parts.append(
+            "Enter your own values for what is assumed: in the config ([robot.limits], "
+            "[robot.sensors]), or here."
+        )
+    return " ".join(parts)
 
 
 def gains_origin(robot: DeployedRobot) -> str:
-    """Return sentences about the origin of a robot's gains and limits, which are not identified."""
-    limits = (
-        "The limits are defaults of slipid and not identified: enter the limits of your motors and "
-        "supply instead."
-    )
-    return f"{gains_sentence(robot)} {limits}"
+    """Return sentences about the origin of a robot's gains and limits."""
+    return f"{gains_sentence(robot)} {settings_origin(robot)}"
 
 
 def gains_sentence(robot: DeployedRobot) -> str:
@@ -248,6 +283,8 @@ HEAD = ("group", "name", "entry", *_NUMBER, "verdict", "provenance", "meaning")
 _TITLES = {
     "gains": "Controller gains",
     "limits": "Limits",
+    "sensors": "Noise of the sensors",
+    "actuators": "Response of the wheels to commands",
     "forward": "Kinematics J: rim speed of a wheel [m/s] from the body twist",
     "inverse": "Pseudo-inverse of J: body twist from rim speeds [m/s]",
     "motor": "Motor, the same for all wheels",
@@ -268,10 +305,9 @@ def table_files(robot: DeployedRobot) -> dict[str, str]:
 
 def _table_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     yield from _gain_rows(robot)
-    for name, value in asdict(Limits.of(robot)).items():
-        unit, about = LIMITS[name]
-        sure = ("by hand", "default of slipid")
-        yield NumberRow("limits", f"limits.{name}", "", "", float(value), unit, None, *sure, about)
+    for path, one in settings(robot).items():
+        number = (path, "", "", one.value, UNITS[path], None)
+        yield NumberRow(path.partition(".")[0], *number, *BASES[one.provenance], SETTINGS[path])
     yield from _matrix_rows(robot)
     yield from _curve_rows(robot)
     ratio, about = float(robot.record.wheels.gear_ratio), "motor speed over wheel speed"
@@ -289,9 +325,9 @@ def _gain_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
         sure = ("tuned, better than set by hand", "robot.json")
     for e in used_gains(robot):
         d = e.declaration
-        known = getattr(tuned.values, e.path, None) if tuned is not None and taken else None
-        spread = None if known is None else known.spread
-        doc = d.doc if spread is None else f"{d.doc}; std at the end of the search {short(spread)}"
+        # gains that a robot was not tuned for have their values set by hand
+        one = getattr(tuned.values, e.path, None) if tuned is not None and taken else None
+        doc = f"{d.doc}; std at the end of the search {short(one.spread)}" if one else d.doc
         about = (d.symbol, float(e.get(gains)), d.unit, None)
         yield NumberRow("gains", f"gains.{e.path}", "", *about, *sure, doc)
 

@@ -83,7 +83,7 @@ def structs_of(loop: ControlLoop[eqx.Module]) -> tuple[Struct, Struct, Struct, S
     The first two are the states of estimator and controller; reading and estimate are the input and
     the output of the estimator's step.
     """
-    begin, nothing = loop.init(), Readings.nothing(loop.controller.robot.wheels)
+    begin, nothing = loop.init(), Readings.nothing(loop.controller.robot.drives)
     estimate = loop.estimator.step(begin.estimator, nothing, jnp.zeros(()))[1]
     return (
         Struct("estimator", fields_of(begin.estimator), begin.estimator),

@@ -24,7 +24,7 @@ class Golden:
     """Successive steps of a robot that starts at rest at the pose 0, 0, 0, one row for each step.
 
     Attributes:
-        given: inputs of the step: all arrays of the reading, the reference, and dt [s],
+        given: inputs of the step: all arrays of the reading, the reference, the twist, and dt [s],
             concatenated.
         said: outputs of the estimator: all arrays of the estimate, concatenated.
         command: outputs of the controller: wheel speeds [rad/s].
@@ -32,7 +32,7 @@ class Golden:
 
     given: Float[np.ndarray, "step input"]
     said: Float[np.ndarray, "step output"]
-    command: Float[np.ndarray, "step wheel"]
+    command: Float[np.ndarray, "step drive"]
 
 
 def golden(loop: ControlLoop[eqx.Module]) -> Golden:
@@ -40,9 +40,9 @@ def golden(loop: ControlLoop[eqx.Module]) -> Golden:
     run = jax.jit(lambda *inputs: loop_step(loop, *inputs))
     begin = loop.init()
     state, rows = (begin.estimator, begin.controller), []
-    for z, reference, dt in _inputs(loop):
-        state, estimate, command = run(state, z, reference, dt)
-        rows.append((_flat((z, reference, dt)), _flat(estimate), np.asarray(command)))
+    for given in _inputs(loop):
+        state, estimate, command = run(state, *given)
+        rows.append((_flat(given), _flat(estimate), np.asarray(command)))
     return Golden(*map(np.array, zip(*rows, strict=True)))
 
 
@@ -51,6 +51,7 @@ def loop_step(
     state: tuple[eqx.Module, ControllerState],
     z: Readings,
     reference: jax.Array,
+    twist: jax.Array,
     dt: jax.Array,
 ) -> tuple[tuple[eqx.Module, ControllerState], StateEstimate, jax.Array]:
     """Return the next state, the estimate and the command of a control loop's step.
@@ -60,21 +61,27 @@ def loop_step(
         state: states of estimator and controller.
         z: readings.
         reference: pose and rates in the world [m, m, rad, m/s, m/s, rad/s].
+        twist: velocity of the body to drive with instead [m/s, m/s, rad/s]; NaN to follow the
+            reference.
         dt: time since the last step [s].
     """
     estimator, estimate = loop.estimator.step(state[0], z, dt)
-    controller, command = loop.controller.step(state[1], reference, estimate, dt)
+    controller, asked = loop.controller.asked(state[1], reference, estimate, dt)
+    twist = jnp.where(jnp.all(jnp.isnan(twist)), asked, twist)
+    controller, command = loop.controller.drive(controller, twist, estimate, dt)
     return (estimator, controller), estimate, command
 
 
-def _inputs(loop: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
-    """Yield reading, reference and time step of every reference step.
+def _inputs(
+    loop: ControlLoop[eqx.Module],
+) -> Iterator[tuple[Readings, jax.Array, jax.Array, float]]:
+    """Yield reading, reference, twist and time step of every reference step.
 
     Among the time steps are a short one, a long one and 0. Readings have gaps, one of which lasts
     longer than `Settings.stale_s`.
     """
     robot = loop.controller.robot
-    angle = np.zeros(robot.wheels)
+    angle = np.zeros(robot.drives)
     for step in range(GOLDEN_STEPS):
         t = step * PERIOD
         twist = np.array([0.15 * np.cos(2 * t), 0.12 * np.sin(3 * t), 0.4 * np.sin(t)])
@@ -84,15 +91,16 @@ def _inputs(loop: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array
         z = Measurement(
             wheel_angle=angle if has_angle else None,
             wheel_speed=speed if step > 40 else None,
-            current=0.4 + 0.1 * np.sin(t + np.arange(robot.wheels)) if step % 5 else None,
+            current=0.4 + 0.1 * np.sin(t + np.arange(robot.drives)) if step % 5 else None,
             voltage=0.3 * speed if step > 17 else None,
             gyro=twist[2] + 0.01 if 6 <= step < 16 else None,
             fix=(0.05, 0.02, 0.05) if has_fix else None,
             fix_std=(0.01, 0.02) if has_fix else None,
             fix_age=0.08 if has_fix else None,
-        ).filled(robot.wheels)
+        ).filled(robot.drives)
         reference = jnp.asarray([0.15 * t, 0.05 * t, 0.1 * t, 0.15, 0.05, 0.1])
-        yield z, reference, {5: 0.02, 15: 0.13, 37: 0.0}.get(step, PERIOD)
+        asked = twist if step % 4 == 3 else np.full(3, np.nan)
+        yield z, reference, jnp.asarray(asked), {5: 0.02, 15: 0.13, 37: 0.0}.get(step, PERIOD)
 
 
 def _flat(tree: object) -> Float[np.ndarray, " flat"]:

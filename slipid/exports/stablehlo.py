@@ -27,7 +27,7 @@ from slipid.robot.interface import Readings
 from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
 
-SCHEMA = "slipid.stablehlo/1"
+SCHEMA = "slipid.stablehlo/2"
 TOLERANCE = 1e-9
 """Largest allowed difference between a number that the loaded program computes and the reference
 step, relative to the number's scale [1]."""
@@ -42,7 +42,7 @@ class Signature:
 
     Attributes:
         state: arrays of the state, which are the first inputs and the first outputs.
-        given: further inputs: readings, reference and dt.
+        given: further inputs: readings, reference, twist and dt.
         said: further outputs: estimate and command.
     """
 
@@ -76,8 +76,8 @@ def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     """
     begin = loop.init()
     state = begin.estimator, begin.controller
-    nothing, zero = Readings.nothing(loop.controller.robot.wheels), jnp.zeros(())
-    like = (state, nothing, jnp.zeros(6), zero)
+    nothing, zero = Readings.nothing(loop.controller.robot.drives), jnp.zeros(())
+    like = (state, nothing, jnp.zeros(6), jnp.zeros(3), zero)
     structure = jax.tree.structure(like)
 
     def step(*flat: Array) -> list[Array]:
@@ -110,10 +110,12 @@ def _signature(loop: ControlLoop[eqx.Module]) -> Signature:
     )
     about = "pose and rates in the world [m, m, rad and per s]"
     reference, dt = Field("reference", "real", (6,), about), "time since the last step [s]"
-    command = Field("command", "real", (loop.controller.robot.wheels,), "wheel speeds [rad/s]")
+    about = "velocity of the body to drive with instead of the reference, or NaN [m/s, m/s, rad/s]"
+    twist = Field("twist", "real", (3,), about)
+    command = Field("command", "real", (loop.controller.robot.drives,), "wheel speeds [rad/s]")
     return Signature(
         state=(*estimator, *controller),
-        given=(*reading, reference, Field("dt", "real", (), dt)),
+        given=(*reading, reference, twist, Field("dt", "real", (), dt)),
         said=(*estimate, command),
     )
 

@@ -183,7 +183,7 @@ def to_json(fit: Fit) -> Content:
         "z": fit.z.tolist(),
         "robot": _robot_json(fit.space.template),
         "choices": [asdict(c) for c in fit.choices],
-        "has": {"current": fit.channels.current, "voltage": fit.channels.voltage},
+        "has": {name: getattr(fit.channels, name) for name in ("current", "voltage", "gyro")},
         "curves": curves_json(fit.curves),
         "validity": {floor: asdict(v) for floor, v in fit.validity.items()},
         "settings": {
@@ -204,6 +204,7 @@ def to_json(fit: Fit) -> Content:
         "calibration": None if fit.calibration is None else fit.calibration.to_json(),
         "selection": {floor: one.to_json() for floor, one in fit.selection.items()},
         "suspects": list(fit.suspects),
+        "robot_settings": {path: list(pair) for path, pair in fit.robot_settings.items()},
         "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
     }
 
@@ -242,6 +243,10 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         calibration=content["calibration"] and Calibration.of_json(content["calibration"]),
         selection={f: FloorSelection.of_json(x) for f, x in content["selection"].items()},
         suspects=tuple(content["suspects"]),
+        robot_settings={
+            path: (value, origin)
+            for path, (value, origin) in content.get("robot_settings", {}).items()
+        },
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
         shared={
             floor: FittedEffects(

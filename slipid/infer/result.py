@@ -62,12 +62,14 @@ class Channels:
         current: True if currents are logged.
         voltage: True if voltages are logged.
         signed: True if currents have a sign, False if they are magnitudes.
+        gyro: True if every run has the yaw rates of a gyro.
         windows: number of windows per segment.
     """
 
     current: bool = True
     voltage: bool = False
     signed: bool = False
+    gyro: bool = False
     windows: int = 4
 
 
@@ -105,6 +107,9 @@ class Fit:
         selection: selected slip model and errors of held-out runs, keyed by floor; empty if no
             model was selected.
         suspects: suspected errors in logs and config, one sentence each.
+        robot_settings: limits of the robot, noise of its sensors and delays of its actuators, as
+            far as config or logs give them: value and origin ("config" or "logs"), keyed by path in
+            robot.json.
         mixed: test of the runs over several floors: their prediction errors in a fit to all other
             runs, and in fits that include half of them; and the end-point errors of the runs on one
             floor, keyed by floor, before and after the runs over several floors were added.
@@ -137,6 +142,7 @@ class Fit:
     calibration: Calibration | None = None
     selection: Mapping[str, FloorSelection] = field(default_factory=dict)
     suspects: tuple[str, ...] = ()
+    robot_settings: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None

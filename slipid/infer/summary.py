@@ -53,6 +53,7 @@ def summarise(
             current=bool(windows.has_current),
             voltage=bool(windows.has_voltage),
             signed=bool(windows.current_is_signed),
+            gyro=all(log.gyro is not None for log in data.logs),
             windows=int(windows.dt.shape[1]),
         ),
         curves=curves_of.curves(problem.space, z, several, problem.batch),

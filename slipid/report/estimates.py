@@ -198,6 +198,7 @@ def show_check(page: Page, found: Content) -> None:
         page.line(_clocks(found["clocks"]))
     for note, count in found["notes"].items():
         page.line(f"repaired in {count} runs: {note}")
+    _show_settings(page, found)
     if "calibration" in found:
         show_calibration(page, Calibration.of_json(found["calibration"]))
     page.notes(found.get("suspects", ()))
@@ -208,6 +209,24 @@ def show_check(page: Page, found: Content) -> None:
         )
         page.table(_expected(found["parameters"] | found["derived"]))
     page.notes(found["messages"])
+
+
+def _show_settings(page: Page, found: Content) -> None:
+    """Write the limits and the noise that logs show, as tables for the config."""
+    if not found["settings"]:
+        return
+    usual, longest = found["gaps_s"]["usual"], found["gaps_s"]["longest"]
+    page.line(
+        "limits and noise of this robot by its logs, which `slipid identify` uses where the config "
+        "has none: the highest values driven, with a reserve of 20 % for wheel speed and motor "
+        "voltage, and the noise while the wheels rest; rows are usually "
+        f"{usual:.3g} s apart, and at most {longest:.3g} s. For the config:"
+    )
+    for group, values in found["settings"].items():
+        page.line(f"\n[robot.{group}]")
+        for key, value in values.items():
+            page.line(f"{key} = {value:g}")
+    page.line()
 
 
 def _expected(numbers: Mapping[str, Content], title: str | None = None) -> Table:

@@ -39,6 +39,7 @@ from slipid.robot.deployed import DeployedRobot, RobotArrays
 from slipid.robot.gains import Gains
 from slipid.robot.interface import UNTIMED_S, StateEstimate, as_arrays
 from slipid.robot.limits import Limits
+from slipid.robot.record import ActuatorRecord
 from slipid.robot.supervision import (
     PROBE_S,
     ControllerState,
@@ -66,7 +67,7 @@ HEADING_ARM_M = 0.2
 """Lever at which a heading that lags behind the path counts as a distance that lags, for robots
 that cannot drive sideways [m]."""
 RESPONSE_S = 0.15
-"""Delay and lag of wheels whose actuators are unknown [s]."""
+"""Delay and lag, together, of wheels whose actuators are unknown [s]."""
 BESIDE_M, BESIDE_SPEED = (0.03, 0.08), 0.05
 """Distances beside the reference between which a robot that cannot drive sideways begins to turn
 towards it [m], and speed of the reference from which on it does not [m/s]."""
@@ -120,6 +121,7 @@ class Controller(eqx.Module):
         gains: gains; by default those that `Gains.of` returns for the robot.
         limits: limits of the command; by default those of the robot.
         recovery: True if a stuck robot may try to free itself.
+        response: delay and lag, together, with which the wheels follow commands [s].
         correction: torque correction of the 2021 paper: "paper_print" as printed in the paper,
             "paper_code" as in the authors' program, "torque" with the errors of both corrected, or
             "none".
@@ -131,6 +133,7 @@ class Controller(eqx.Module):
     gains: Gains
     limits: Limits
     recovery: Bool[Array, ""]
+    response: Float[Array, ""]
     correction: Correction = eqx.field(static=True)
     law: Law | None = None
 
@@ -156,6 +159,9 @@ class Controller(eqx.Module):
         if recovery is None:
             recovery = isinstance(robot, DeployedRobot) and robot.record.sensors.gyro
         self.robot, self.recovery = robot.arrays, jnp.asarray(recovery)
+        actuators = robot.record.actuators if isinstance(robot, DeployedRobot) else ActuatorRecord()
+        late = RESPONSE_S if actuators.response_s is None else actuators.response_s
+        self.response = jnp.asarray(late, dtype=float)
         self.limits = as_arrays(Limits.of(robot) if limits is None else limits)
         self.correction, self.law = correction, law
         self.gains = Gains.of(robot) if gains is None else gains
@@ -203,21 +209,35 @@ class Controller(eqx.Module):
             estimate: output of an estimator.
             dt: time since the last step [s].
         """
+        state, twist = self.asked(state, reference, estimate, dt)
+        return self.drive(state, twist, estimate, dt)
+
+    def asked(
+        self,
+        state: ControllerState,
+        reference: Float[Array, "6"],
+        estimate: StateEstimate,
+        dt: Float[Array, ""] | float,
+    ) -> tuple[ControllerState, Float[Array, "3"]]:
+        """Return the state, and the twist that follows a reference [m/s, m/s, rad/s].
+
+        Arguments are those of `step`, which passes the twist on to `drive`. The twist is NaN if the
+        reference or the estimate cannot be used.
+        """
         k, usable = self.gains, self._usable(estimate, reference)
         ref, pose = jnp.where(usable, reference, 0.0), jnp.where(usable, estimate.pose, 0.0)
         gap = ref[:2] - pose[:2]
-        if self.law is not None:
-            asked = self.law(ref, pose)
-        elif self.robot.holonomic:
-            asked = self._free_pose_loop(ref, pose, k.place * gap + state.integral)
-        else:
-            asked = self._tangent_pose_loop(ref, pose, gap, state.integral)
-        new, command, free = self._commanded(state, asked, estimate, dt, usable)
-        # freeze the integral while a limit is active, so that it does not wind up
-        summed = state.integral + k.integral * gap * self._time_step(dt)
+        # the integral rests while a limit is active, so that it does not wind up
+        summed = state.integral + k.integral * gap * _time_step(dt)
         summed = jnp.clip(summed, -LARGEST_INTEGRAL, LARGEST_INTEGRAL)
-        summed = jnp.where(free, summed, jnp.where(usable, state.integral, 0.0))
-        return replace(new, integral=jnp.where(new.drives_off, 0.0, summed)), command
+        integral = jnp.where(usable & ~state.limited, summed, state.integral)
+        if self.law is not None:
+            twist = self.law(ref, pose)
+        elif self.robot.holonomic:
+            twist = self._free_pose_loop(ref, pose, k.place * gap + integral)
+        else:
+            twist = self._tangent_pose_loop(ref, pose, gap, integral)
+        return replace(state, integral=integral), jnp.where(usable, twist, jnp.nan)
 
     def drive(
         self,
@@ -237,32 +257,11 @@ class Controller(eqx.Module):
             estimate: output of an estimator.
             dt: time since the last step [s].
         """
-        usable = self._usable(estimate, twist)
+        f, k, e, old, dt = self.robot, self.gains, estimate, state, _time_step(dt)
+        usable = self._usable(e, twist)
         asked = jnp.where(usable, twist, 0.0)
-        if not self.robot.holonomic:
+        if not f.holonomic:
             asked = asked.at[1].set(0.0)
-        new, command, _ = self._commanded(state, asked, estimate, dt, usable)
-        return replace(new, integral=jnp.zeros(2)), command
-
-    def _usable(self, e: StateEstimate, demand: Array) -> Bool[Array, ""]:
-        """Return whether the estimate and the demand can be used."""
-        return e.finite & jnp.all(jnp.isfinite(demand)) & ~e.stale
-
-    def _time_step(self, dt: Float[Array, ""] | float) -> Float[Array, ""]:
-        """Return a time step limited to half a second; 0 if it is not a positive number [s]."""
-        dt = jnp.asarray(dt, dtype=float)
-        return jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
-
-    def _commanded(
-        self,
-        old: ControllerState,
-        asked: Float[Array, "3"],
-        e: StateEstimate,
-        dt: Float[Array, ""] | float,
-        usable: Bool[Array, ""],
-    ) -> tuple[ControllerState, Float[Array, " drive"], Bool[Array, ""]]:
-        """Return the next state, wheel speeds [rad/s], and whether no limit is active."""
-        f, k, dt = self.robot, self.gains, self._time_step(dt)
         now = replace(
             e,
             twist=jnp.where(usable, e.twist, 0.0),
@@ -277,9 +276,9 @@ class Controller(eqx.Module):
             recovery=self.recovery,
             highest_speed=self.limits.speed,
             probe=probe,
-            response=jnp.asarray(RESPONSE_S),
+            response=self.response,
         )
-        drives = usable & ~new.gave_up
+        moves = usable & ~new.gave_up
         wanted = self._limited_twist(asked * recovery_factors(old.tried))
         # low-pass filter the disturbance: the estimated twist less the last step's demanded twist
         a = 1 - jnp.exp(-dt / OBSERVER_S)
@@ -289,19 +288,24 @@ class Controller(eqx.Module):
         # a small speed shows whether drives that were off turn again
         most = jnp.max(jnp.abs(wheels))
         slower = jnp.where(new.drives_off, jnp.minimum(probe / jnp.maximum(most, 1e-9), 1.0), 1.0)
-        wheels = jnp.where(drives, wheels * slower, 0.0)
-        before = jnp.where(old.begun, old.command, jnp.where(drives, e.wheel_speed, 0.0))
-        since = jnp.where(drives, dt, jnp.maximum(dt, UNTIMED_S))
+        wheels = jnp.where(moves, wheels * slower, 0.0)
+        before = jnp.where(old.begun, old.command, jnp.where(moves, e.wheel_speed, 0.0))
+        since = jnp.where(moves, dt, jnp.maximum(dt, UNTIMED_S))
         command = limit_command(wheels, before, e.current, f, self.limits, since)
-        miss = jnp.where(drives & ~new.drives_off, jnp.clip(miss, -0.2, 0.2), 0.0)
         new = replace(
             new,
             command=command,
-            wanted=jnp.where(drives, demand, 0.0),
-            miss=miss,
+            integral=jnp.where(new.drives_off, 0.0, old.integral),
+            wanted=jnp.where(moves, demand, 0.0),
+            miss=jnp.where(moves & ~new.drives_off, jnp.clip(miss, -0.2, 0.2), 0.0),
+            limited=~moves | (jnp.max(jnp.abs(command - wheels)) >= 0.05),
             begun=jnp.ones((), bool),
         )
-        return new, command, drives & (jnp.max(jnp.abs(command - wheels)) < 0.05)
+        return new, command
+
+    def _usable(self, e: StateEstimate, demand: Array) -> Bool[Array, ""]:
+        """Return whether the estimate and the demand can be used."""
+        return e.finite & jnp.all(jnp.isfinite(demand)) & ~e.stale
 
     def _wheel_speeds(self, twist: Array, e: StateEstimate) -> Float[Array, " drive"]:
         """Return the wheel speeds that move the body with a twist on the floors believed [rad/s].
@@ -341,7 +345,9 @@ class Controller(eqx.Module):
         k = self.gains
         ahead, left = _rotated(gap, -pose[2])
         off = jnp.arctan2(jnp.sin(ref[2] - pose[2]), jnp.cos(ref[2] - pose[2]))
-        speed = ref[3] * jnp.cos(ref[2]) + ref[4] * jnp.sin(ref[2])
+        # rates are read ahead on the path, so that only the sign is that along the present heading
+        along = ref[3] * jnp.cos(ref[2]) + ref[4] * jnp.sin(ref[2])
+        speed = jnp.where(along < 0, -1.0, 1.0) * jnp.sqrt(ref[3:5] @ ref[3:5] + 1e-18)
         # beside a resting reference the robot first turns towards it, or away to drive in reverse
         near, far = BESIDE_M
         aside = jnp.clip((jnp.abs(_rotated(gap, -ref[2])[1]) - near) / (far - near), 0.0, 1.0)
@@ -384,6 +390,12 @@ class Controller(eqx.Module):
         moves = jnp.max(jnp.abs(e.wheel_speed)) > 0.5
         rpm = jnp.where(moves, gain * moment, 0.0)
         return rpm * (2 * np.pi / 60) / f.motor.gear_ratio
+
+
+def _time_step(dt: Float[Array, ""] | float) -> Float[Array, ""]:
+    """Return a time step limited to half a second; 0 if it is not a positive number [s]."""
+    dt = jnp.asarray(dt, dtype=float)
+    return jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
 
 
 def _rotated(v: Float[Array, "2"], angle: Array) -> tuple[Array, Array]:

@@ -269,6 +269,13 @@ class ActuatorRecord:
     delay_s: Setting | None = None
     lag_s: Setting | None = None
 
+    @property
+    def response_s(self) -> float | None:
+        """Delay and lag together [s]; None if one of them is unknown."""
+        if self.delay_s is None or self.lag_s is None:
+            return None
+        return self.delay_s.value + self.lag_s.value
+
 
 @dataclass(frozen=True)
 class GainRecord:

@@ -66,6 +66,7 @@ class ControllerState(eqx.Module):
         drives_off: True if wheels do not follow their commands; nothing escalates meanwhile.
         gave_up: True if the robot was stuck and has stopped until it is armed again, by `rearmed`
             or by a demand of no motion for `REARM_S`.
+        limited: True if a limit was active in the last command.
         begun: True if a command has been computed already.
     """
 
@@ -81,14 +82,15 @@ class ControllerState(eqx.Module):
     resting: Float[Array, ""]
     drives_off: Bool[Array, ""]
     gave_up: Bool[Array, ""]
+    limited: Bool[Array, ""]
     begun: Bool[Array, ""]
 
     @classmethod
     def init(cls, drives: int) -> "ControllerState":
         """Return the state of a robot at rest before its first command."""
-        each, zero, no = jnp.zeros(drives), jnp.zeros(()), jnp.zeros((), bool)
-        twist = jnp.zeros(3)
-        return cls(each, jnp.zeros(2), twist, twist, zero, zero, each, each, zero, zero, no, no, no)
+        each, twist = jnp.zeros(drives), jnp.zeros(3)
+        zero, no = (jnp.zeros(()),) * 2, (jnp.zeros((), bool),) * 4
+        return cls(each, jnp.zeros(2), twist, twist, *zero, each, each, *zero, *no)
 
     def rearmed(self) -> "ControllerState":
         """Return the state of a robot that no longer counts as stuck."""

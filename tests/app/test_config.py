@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.app.config import geometry, read_config
+from slipid.app.check import overview
+from slipid.app.config import geometry, given_settings, read_config
 from slipid.app.problem import read_fit_task
+from slipid.report.estimates import show_check
+from slipid.report.page import text_of
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import generic_text, robotino_text, write_good
 from tests.helpers.said import KeptMessages
@@ -112,6 +115,21 @@ def test_other_drives(tmp_path, section, wheels, grips):
         ("gear_ratio = 16", "gear_ratio = -16", ["robot.gear_ratio: -16", "greater than 0"]),
         ("gear_ratio = 16", 'gear_ratio = "16:1"', ["robot.gear_ratio: '16:1'", "number"]),
         ("mass_kg = 12.0", "mass_kg = nan", ["robot.mass_kg: nan", "finite"]),
+        (
+            "mass_kg = 12.0",
+            "mass_kg = 12.0\nlimits = { speed_m_s = 0, speed = 1 }",
+            ["robot.limits.speed_m_s: 0", "greater than 0", "speed: no such key, did you mean"],
+        ),
+        (
+            "mass_kg = 12.0",
+            "mass_kg = 12.0\nlimits = { wheel_speed_rad_s = 4000 }",
+            ["robot.limits.wheel_speed_rad_s: 4000", "less than or equal to 1000"],
+        ),
+        (
+            "mass_kg = 12.0",
+            "mass_kg = 12.0\nsensors = { gyro_std_rad_s = nan }\nactuators = { lag_s = -1 }",
+            ["robot.sensors.gyro_std_rad_s: nan", "robot.actuators.lag_s: -1", "or equal to 0"],
+        ),
         ("[60, 180, 300]", "[60, 180]", ["robot.wheel_azimuths_deg", "at least 3"]),
         ("[[logs]]", "[[log]]", ["log: no such key", "did you mean logs", "logs: missing"]),
         ("glob =", "globb =", ["logs[1].globb: no such key", "mean glob", "logs[1].glob: missing"]),
@@ -188,6 +206,27 @@ def test_values_of_the_robot_section_are_centres_of_priors(tmp_path):
     np.testing.assert_allclose(prior("robot.wheel_radius"), [[0.04], [0.02]])
     np.testing.assert_allclose(prior("robot.mass"), [[12.0], [0.1]])
     np.testing.assert_allclose(prior("robot.base_radius"), [[0.13], [0.005 / 0.13]])
+
+
+def test_limits_are_those_of_the_config_and_else_of_the_logs(tmp_path):
+    write_good(tmp_path)
+    shown = job_of(tmp_path, GOOD).robot_settings
+    assert {origin for _, origin in shown.values()} == {"logs"}
+    table = "limits = { speed_m_s = 0.7 }\nactuators = { lag_s = 0 }\nmass_kg = 12.0"
+    own = job_of(tmp_path, GOOD.replace("mass_kg = 12.0", table)).robot_settings
+    both = {"limits.speed": (0.7, "config"), "actuators.lag_s": (0.0, "config")}
+    assert own == shown | both != shown
+    assert shown["limits.speed"][0] < 0.7
+
+
+def test_the_limits_that_check_prints_can_be_pasted_into_the_config(tmp_path):
+    write_good(tmp_path)
+    job = job_of(tmp_path, GOOD)
+    text = text_of(show_check, overview(job) | {"parameters": {}, "derived": {}, "messages": []})
+    block = [line for line in text.splitlines() if line.startswith("[robot.") or " = " in line]
+    pasted = GOOD.replace("[[logs]]", "\n".join([*block, "[[logs]]"]))
+    given = given_settings(read_config(written(tmp_path, pasted)).content.wheels)
+    assert {path: (value, "logs") for path, value in given.items()} == job.robot_settings != {}
 
 
 def test_any_name_of_a_floor_will_do(tmp_path):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from slipid.data.log import Log
-from slipid.data.runs import collect
 from slipid.data.wheel_response import wheel_response
 from slipid.model.geometry import omni
 
@@ -61,7 +60,7 @@ def run(seed, delay=0.12, lag=0.08, rim=50.0, noise=0.0, slow=1.0, smooth=0.0, b
 
 
 def found(count=6, **how):
-    return wheel_response(collect([run(seed, **how) for seed in range(count)]), SHAPE)
+    return wheel_response([run(seed, **how) for seed in range(count)], SHAPE)
 
 
 @pytest.mark.parametrize(
@@ -99,12 +98,12 @@ def test_commanded_wheel_speeds_say_the_same_as_commanded_twists():
 def test_logs_without_commands_or_with_unlike_commands_are_refused():
     logs = [run(seed) for seed in range(6)]
     silent = [run(seed, by_twist=False) for seed in range(2)]
-    assert wheel_response(collect(silent), SHAPE) is None
+    assert wheel_response(silent, SHAPE) is None
     shuffled = [
         Log(**{**vars(log), "twist_command": other.twist_command})
         for log, other in zip(logs, [*logs[1:], logs[0]], strict=True)
     ]
-    assert wheel_response(collect(shuffled), SHAPE) is None
+    assert wheel_response(shuffled, SHAPE) is None
 
 
 def test_commands_that_change_slowly_and_noisy_wheels_are_refused():

@@ -11,6 +11,8 @@ from slipid.app.problem import read_fit_task
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.robot.interface import Measurement
+from slipid.robot.limits import Limits
+from slipid.robot.record import Setting
 from slipid.support.progress import Reporter
 from tests.benchmarks.every_robot.drive import write
 from tests.benchmarks.every_robot.rivals import read
@@ -58,6 +60,22 @@ def test_its_estimator_predicts_a_fresh_run(calibrated):
             state, estimate = estimator.step(state, Measurement(wheel_angle=angle), dt)
         gap = np.asarray(estimate.pose)[:2] - track.pose[-1, :2]
         assert np.hypot(*gap) < 0.015 * truth[track.name].path
+
+
+def test_its_limits_are_those_of_its_own_runs(calibrated):
+    """Not those of another robot; noise of sensors that were not logged is assumed."""
+    folder, out, _, _ = calibrated
+    robot = DeployedRobot.load(out / "robot.json")
+    task = read_fit_task(read_config(folder / "robot.toml"), folder / "logs", Reporter(quiet=True))
+    limits, radius = robot.record.limits, float(task.robot.geometry.wheel_radius)
+    assert limits.wheel_speed == Setting(task.robot_settings["limits.wheel_speed"][0], "logs")
+    assert limits.speed.provenance == "logs"
+    assert limits.speed.value == pytest.approx(limits.wheel_speed.value / 1.2 * radius, rel=0.1)
+    for name, value in vars(Limits()).items():
+        if name not in ("acceleration", "yaw_rate"):
+            assert getattr(Limits.of(robot), name) != value
+    assert robot.record.sensors.ammeter_std_a.provenance == "assumed"
+    assert robot.record.actuators.delay_s is None
 
 
 def test_its_kinematics_are_not_those_of_the_config(calibrated):

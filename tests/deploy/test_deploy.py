@@ -17,6 +17,8 @@ from slipid.infer.fit_file import load
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.gains import Gains
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
+from slipid.robot.limits import Limits
+from slipid.robot.record import Setting
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_json
 from tests.helpers.shared import DRIVES, invoke
@@ -60,6 +62,11 @@ def test_a_fit_writes_its_robot(fitted):
     assert Settings.of(robot).further_floor_penalty == penalty != MIXED_FLOORS_PENALTY
     free = {path for path in fit.space.slices if not path.startswith("camera.")}
     assert set(record.draws) == free
+    for path, (value, origin) in fit.robot_settings.items():
+        group, _, name = path.partition(".")
+        assert getattr(getattr(record, group), name) == Setting(value, origin)
+    assert {"limits.speed", "limits.voltage"} <= fit.robot_settings.keys()
+    assert Limits.of(robot).speed == fit.robot_settings["limits.speed"][0] != Limits().speed
     again = deploy(fit)
     assert again.record == record
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(robot), strict=True):

@@ -52,12 +52,12 @@ def test_it_compiles_without_a_warning_and_repeats_the_librarys_steps(
 @pytest.mark.slow
 def test_the_folders_test_fails_where_a_number_is_another_one(folder, tmp_path):
     golden = (folder / "test/golden.h").read_text()
-    head, _, rest = golden.partition("golden_command[GOLDEN_STEPS][SLIPID_WHEELS] = {")
+    head, _, rest = golden.partition("golden_command[GOLDEN_STEPS][SLIPID_DRIVES] = {")
     changed = re.sub(r"(\d\.\d{4})\d", lambda m: f"{m[1]}{(int(m[0][-1]) + 1) % 10}", rest, count=1)
     assert changed != rest
     shutil.copytree(folder, tmp_path / "c")
     (tmp_path / "c/test/golden.h").write_text(
-        f"{head}golden_command[GOLDEN_STEPS][SLIPID_WHEELS] = {{{changed}"
+        f"{head}golden_command[GOLDEN_STEPS][SLIPID_DRIVES] = {{{changed}"
     )
     assert built(tmp_path / "c", tmp_path / "check", "-O1").returncode == 0
     result = subprocess.run([tmp_path / "check"], capture_output=True, text=True)

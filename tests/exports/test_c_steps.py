@@ -113,6 +113,7 @@ def test_every_field_has_a_unit():
     plain = {f.name for s in code("contact").structs for f in s.fields if f.about.endswith("[1]")}
     assert plain == {
         *("floors_belief", "floors_expected", "place_toward", "begun", "slip"),
+        *("drives_off", "gave_up", "limited"),
         *("surface_probability", "stale", "immobilised", "out_of_range"),
     }
 

@@ -17,6 +17,7 @@ from slipid.exports.ros.yaml_text import scalar
 from slipid.exports.text import identifiers
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.gains import Gains
+from slipid.robot.interface import Settings
 from slipid.robot.limits import Limits
 from tests.helpers.exported import LOADS, ODD, mecanum_robot
 from tests.helpers.ros_yaml import flat, parameters, read
@@ -145,7 +146,7 @@ def test_defaults_are_the_values_and_all_is_described(node, declared):
         assert set(d) <= KEYS
         assert d["default_value"] == node[name]
         assert d["description"]
-        changes = name.startswith(("gains.", "limits."))
+        changes = name.startswith(("gains.", "limits.", "sensors."))
         assert d["read_only"] is not changes
 
 
@@ -206,6 +207,8 @@ def test_gains_and_limits_are_those_of_the_controller(robot):
         assert {name: node[f"gains.{name}"] for name in gains} == gains
         limits = vars(Limits())
         assert {name: node[f"limits.{name}"] for name in limits} == limits
+        noise = {name: getattr(Settings.of(made), name) for name in ("gyro_std", "ammeter_std_a")}
+        assert {name: node[f"sensors.{name}"] for name in noise} == noise
         assert node["load_setup"] == load.replace(" ", "_")
     assert gains["yaw"] == 0.1
 

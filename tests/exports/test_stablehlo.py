@@ -38,14 +38,19 @@ def test_a_loaded_program_gives_the_results_of_the_control_loop(folder):
     begin, rng = LOOP.init(), np.random.default_rng(0)
     state = begin.estimator, begin.controller
     kept, many = list(program.start), [jnp.stack([x] * count) for x in program.start]
-    for _ in range(10):
+    for k in range(10):
         z = Readings.nothing(3)
         z = z.__class__(**{**vars(z), "wheel_speed": jnp.asarray(rng.normal(size=3))})
         reference = jnp.asarray(rng.normal(size=6))
         estimator, estimate = LOOP.estimator.step(state[0], z, PERIOD)
-        controller, command = LOOP.controller.step(state[1], reference, estimate, PERIOD)
+        if k % 2:
+            twist = jnp.full(3, jnp.nan)
+            controller, command = LOOP.controller.step(state[1], reference, estimate, PERIOD)
+        else:
+            twist = jnp.asarray(0.1 * rng.normal(size=3))
+            controller, command = LOOP.controller.drive(state[1], twist, estimate, PERIOD)
         state = estimator, controller
-        given = [*jax.tree.leaves(z), reference, jnp.asarray(PERIOD)]
+        given = [*jax.tree.leaves(z), reference, twist, jnp.asarray(PERIOD)]
         found = program.step.call(*kept, *given)
         both = program.batch.call(*many, *(jnp.stack([x] * count) for x in given))
         wanted = jax.tree.leaves((state, estimate, command))
@@ -59,7 +64,7 @@ def test_a_loaded_program_gives_the_results_of_the_control_loop(folder):
 def test_it_says_what_its_arrays_are(folder):
     program = load_program(folder)
     s = program.signature
-    assert [leaf.name for leaf in s.given][-3:] == ["reading.fix_age", "reference", "dt"]
+    assert [leaf.name for leaf in s.given][-4:] == ["reading.fix_age", "reference", "twist", "dt"]
     assert len(program.step.in_avals) == len(s.state) + len(s.given)
     shapes = [leaf.shape for leaf in (*s.state, *s.given)]
     assert [a.shape for a in program.step.in_avals] == shapes
@@ -82,7 +87,7 @@ def test_a_lost_or_damaged_file_is_one_sentence(folder, name):
 def test_a_newer_file_is_refused(folder):
     about = json.loads((folder / "step.json").read_text())
     assert about["schema"] == SCHEMA
-    about["schema"] = "slipid.stablehlo/2"
+    about["schema"] = "slipid.stablehlo/3"
     (folder / "step.json").write_text(json.dumps(about))
     with pytest.raises(DataError, match="update slipid"):
         load_program(folder)

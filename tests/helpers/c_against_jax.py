@@ -69,7 +69,7 @@ class Source:
     """Batches of steps by JAX, each of which goes on from the last."""
 
     def __init__(self, control_loop: ControlLoop, draw: Draw, robots: int, steps: int):
-        wheels = control_loop.controller.robot.wheels
+        wheels = control_loop.controller.robot.drives
         self._key, self._steps = jax.random.key(0), steps
 
         def one(given):

@@ -98,7 +98,7 @@ class CompiledC:
         self.controller = np.zeros((), self.kinds.of(code.controller))
         self.reading = np.zeros((), self.kinds.of(code.reading))
         self.estimate = np.zeros((), self.kinds.of(code.estimate))
-        self.command = np.zeros(code.loop.controller.robot.wheels, self.kinds.real)
+        self.command = np.zeros(code.loop.controller.robot.drives, self.kinds.real)
         self.time = np.zeros((), self.kinds.real)
         self.reference = np.zeros(6, self.kinds.real)
 

@@ -10,11 +10,12 @@ import pytest
 
 from slipid.model.kinematics import Steering
 from slipid.model.robot import build, steady_states
-from slipid.robot.controller import Controller
+from slipid.robot.controller import RESPONSE_S, Controller
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Odometry
 from slipid.robot.gains import Gains
 from slipid.robot.interface import Readings
+from slipid.robot.record import ActuatorRecord, Setting
 from slipid.robot.supervision import OFF_S, PROBE_S
 from slipid.search_space import Choice, Space
 from tests.helpers.kinds import FLOORS, SHAPES, numbers
@@ -146,6 +147,14 @@ def test_a_robot_that_cannot_go_sideways_reaches_its_reference(truth):
             # a reference at rest is reached to where the robot no longer turns towards it
             assert np.hypot(x, y) < (0.055 if rates[0] == 0 else 0.06), (rates, start)
             assert abs(yaw) < 0.25, (rates, start)
+
+
+def test_wheels_answer_as_late_as_the_record_says(robot):
+    slow = ActuatorRecord(delay_s=Setting(0.2, "config"), lag_s=Setting(0.3, "logs"))
+    known = DeployedRobot.of(replace(robot.record, actuators=slow))
+    assert float(Controller(known).response) == 0.5
+    half = DeployedRobot.of(replace(robot.record, actuators=replace(slow, lag_s=None)))
+    assert float(Controller(half).response) == float(Controller(robot).response) == RESPONSE_S
 
 
 def test_a_robot_that_steers_has_no_controller(robot):

@@ -72,7 +72,7 @@ def _head(draft: ConfigDraft, name: str) -> tuple[str, ...]:
 
 def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock:
     """Return the table `[robot]`, with the drawing above it."""
-    given = robot.model_dump(exclude_none=True)
+    given = robot.model_dump(exclude_none=True, exclude={"limits", "sensors", "actuators"})
     if isinstance(robot, OmniDrive) and robot.roller_angle_deg == 90.0:
         del given["roller_angle_deg"]  # the default: ordinary omni wheels need no line for it
     # The keys of the type of drive come first; the keys that all robots have come after them.

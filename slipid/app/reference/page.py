@@ -24,6 +24,9 @@ _DRIVES: tuple[tuple[type[Any], str, dict[str, object] | None], ...] = (
 )
 """Model and name of each type of drive, and sizes of an example robot if one is drawn."""
 _SECTIONS: tuple[tuple[str, type], ...] = (
+    ("[robot.limits]", c.LimitsSection),
+    ("[robot.sensors]", c.SensorsSection),
+    ("[robot.actuators]", c.ActuatorsSection),
     ("[[logs]]", c.LogsSection),
     ("[camera]", c.CameraSection),
     ('[parameters] "PATTERN"', c.ParameterSection),

@@ -52,7 +52,7 @@ class Code:
         self.functions = list(self._functions())
 
     def _functions(self) -> Iterator[Function]:
-        loop, path, wheels = self.loop, self.path, self.robot.wheels
+        loop, path, drives = self.loop, self.path, self.robot.drives
         estimator, controller, reading, estimate = (
             Argument(struct.name, struct) for struct in self.structs
         )
@@ -60,7 +60,7 @@ class Code:
             Argument.plain(*one) for one in (("pose", (3,)), ("dt", ()), ("time", ()))
         )
         reference = Argument.plain("reference", (6,))
-        command = Argument.plain("command", (wheels,)).made
+        twist, command = Argument.plain("twist", (3,)), Argument.plain("command", (drives,)).made
 
         def begin(pose: jax.Array) -> tuple[object, object]:
             return loop.init(pose).estimator, loop.init(pose).controller
@@ -68,16 +68,19 @@ class Code:
         def follow(time: jax.Array, pose: jax.Array, dt: jax.Array) -> object:
             return loop.controller.follow(path, time, pose, dt)
 
-        step = controller.changed, reference, estimate, dt, command
+        asked = controller.changed, reference, estimate, dt, twist.made
+        move = controller.changed, twist, estimate, dt, command
         for name, run, arguments in (
             ("slipid_begin", begin, (estimator.made, controller.made, pose)),
-            ("slipid_nothing", lambda: Readings.nothing(wheels), (reading.made,)),
+            ("slipid_nothing", lambda: Readings.nothing(drives), (reading.made,)),
             (
                 "slipid_observe",
                 loop.estimator.step,
                 (estimator.changed, reading, dt, estimate.made),
             ),
-            ("slipid_command", loop.controller.step, step),
+            ("slipid_asked", loop.controller.asked, asked),
+            ("slipid_move", loop.controller.drive, move),
+            ("slipid_rearm", loop.controller.rearmed, (controller.changed,)),
             ("slipid_follow", follow, (time.changed, pose, dt, reference.made)),
         ):
             yield function(self._names, name, arguments, run)
@@ -98,6 +101,7 @@ class Code:
         names = identifiers(robot.labels, "floor")
         defines = [
             f"SLIPID_WHEELS {robot.wheels}",
+            f"SLIPID_DRIVES {robot.drives}",
             f"SLIPID_FLOORS {len(robot.labels)}",
             *(f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(names)),
             f"SLIPID_PATH_SECONDS {self.path.duration!r}",
@@ -142,12 +146,14 @@ def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
         "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: the axes "
         "in which the start pose is given. A twist is in the body's axes."
     )
-    rows = zip(robot.places.tolist(), robot.forward.tolist(), strict=True)
-    for k, ((x, y), row) in enumerate(rows):
-        drives = math.degrees(math.atan2(row[1], row[0]))
+    for k, (x, y) in enumerate(robot.places.tolist()):
+        drive = robot.drive_of[k] if robot.drive_of else k
+        row = robot.forward[drive].tolist()
+        ahead = math.degrees(math.atan2(row[1], row[0]))
+        motor = f", turned by motor {drive}" if robot.drive_of else ""
         yield (
-            f"Wheel {k} is at x = {x:.4f} m, y = {y:.4f} m; with a positive speed it pushes the "
-            f"body in the direction {drives:.1f} deg."
+            f"Wheel {k} is at x = {x:.4f} m, y = {y:.4f} m{motor}; with a positive speed it pushes "
+            f"the body in the direction {ahead:.1f} deg."
         )
     settings = loop.estimator.settings
     signs = (

@@ -85,7 +85,7 @@ class Recording:
     plant: str
     start: tuple[float, float, float]
     given: Float[np.ndarray, "step given"]
-    command: Float[np.ndarray, "step wheel"]
+    command: Float[np.ndarray, "step drive"]
     time: Float[np.ndarray, " step"]
 
     @property
@@ -137,6 +137,8 @@ def c_files(
         "RECORDING": example,
         "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
         "WHEELS": str(robot.wheels),
+        "DRIVES": str(robot.drives),
+        "RECOVERY": "" if bool(loop.controller.recovery) else " (recovery is off in this export)",
         "STATE": state,
         "STACK": stack,
         "PATH": f"from ({x:.2f}, {y:.2f}), heading {heading:.2f} rad, over {', '.join(corners)} "

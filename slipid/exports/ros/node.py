@@ -6,19 +6,17 @@ are in the order of robot.json; matrices are in row-major order.
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict
 
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.exports.description import LIMITS, gains_origin, verdict_text
+from slipid.exports.description import BASES, SETTINGS, gains_origin, settings, verdict_text
 from slipid.exports.ros.yaml_text import Check, Parameter
 from slipid.exports.text import identifiers, interval, listed
 from slipid.parameter import Entry
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.gains import Gains, used_gains
-from slipid.robot.limits import Limits
-from slipid.robot.record import RecordedNumber
+from slipid.robot.record import UNITS, RecordedNumber
 from slipid.robot.robot_file import declared_numbers
 
 NODE = "slipid"
@@ -120,17 +118,18 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
 
 
 def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Yield gains and limits, which may be changed while the node runs."""
+    """Yield gains, limits and settings of sensors, which may be changed while the node runs."""
     gains = Gains.of(robot)
     for e in used_gains(robot):
         about = f"{e.declaration.doc} {e.declaration.symbol} [{e.declaration.unit}]"
         if e.path == "place":
             about = f"{about}. {gains_origin(robot)}"
         yield Parameter(f"gains.{e.path}", float(e.get(gains)), about, (), read_only=False)
-    for name, value in asdict(Limits.of(robot)).items():
-        unit, about = LIMITS[name]
-        check = (Check("gt<>", (0.0,)),)
-        yield Parameter(f"limits.{name}", float(value), f"{about} [{unit}]", check, read_only=False)
+    for path, one in settings(robot).items():
+        verdict, origin = BASES[one.provenance]
+        about = f"{SETTINGS[path]} [{UNITS[path]}]; {verdict}, {origin}"
+        check = Check("gt_eq<>" if path.startswith("actuators.") else "gt<>", (0.0,))
+        yield Parameter(path, one.value, about, (check,), read_only=False)
 
 
 def _size(count: int) -> Check:

@@ -33,7 +33,7 @@ _IDENTIFY_CONFIG = """\
 wheel_radius_m = {radius}
 gear_ratio = {gear}
 mass_kg = {mass}
-
+{own}
 [layouts.testsite]
 ticks_per_revolution = {ticks}
 gear_ratio = {gear}
@@ -49,6 +49,21 @@ current_is_signed = {signed}
 "motor.resistance" = {{ start = {r[0]}, prior = {{ mean = {r[1]}, std = {r[2]} }} }}
 "motor.back_emf" = {{ start = {c[0]}, prior = {{ mean = {c[1]}, std = {c[2]} }} }}
 {place}"""
+_OMNI_LIMITS = """
+[robot.limits]
+speed_m_s = 0.5
+yaw_rate_rad_s = 2.0
+acceleration_m_s2 = 1.0
+wheel_speed_rad_s = 13.0
+voltage_v = 22.0
+
+[robot.sensors]
+ammeter_std_a = 0.07
+voltmeter_std_v = 0.06
+gyro_std_rad_s = 0.004
+gyro_bias_std_rad_s = 0.01
+stale_s = 0.3
+"""
 _MARKER_PLACE = '"camera.marker_place" = { prior = { mean = [0.0, 0.0], std = 0.1 } }\n'
 _TRACKED_LAYOUT = """
 # poses of each run, tracked in its video by slipid track, for example:
@@ -237,6 +252,7 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
         radius=robot.wheel_radius_m,
         gear=robot.gear_ratio,
         mass=robot.mass_kg,
+        own=_OMNI_LIMITS if robot.drive == "omni" else "",
         ticks=plan.site.motor.ticks_per_revolution,
         signed=str(sensors.current_is_signed).lower(),
         columns="\n".join(f"{name} = {_inline(c)}" for name, c in columns.items()),

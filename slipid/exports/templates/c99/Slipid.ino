@@ -6,7 +6,7 @@
 static slipid_state state;
 static slipid_reading reading;
 static slipid_estimate estimate;
-static slipid_real command[SLIPID_WHEELS];
+static slipid_real command[SLIPID_DRIVES];
 static unsigned long last_ms;
 
 void setup() {

@@ -29,26 +29,30 @@ int main(void) {
   static slipid_estimate estimate;
   static slipid_reading reading;
   const slipid_real start[3] = {0, 0, 0};
-  slipid_real command[SLIPID_WHEELS];
+  slipid_real command[SLIPID_DRIVES];
   double said[GOLDEN_SAID];
   slipid_init(&state, start);
   for (int step = 0; step < GOLDEN_STEPS; ++step) {
-    slipid_real reference[6];
+    slipid_real demand[9]; /* reference, twist */
+    const slipid_real dt = (slipid_real)golden_given[step][GOLDEN_GIVEN - 1];
     golden_reading(&reading, golden_given[step]);
-    for (int k = 0; k < 6; ++k) {
-      reference[k] = (slipid_real)golden_given[step][GOLDEN_GIVEN - 7 + k];
+    for (int k = 0; k < 9; ++k) {
+      demand[k] = (slipid_real)golden_given[step][GOLDEN_GIVEN - 10 + k];
     }
-    slipid_step(&state, &reading, reference, (slipid_real)golden_given[step][GOLDEN_GIVEN - 1],
-                &estimate, command);
+    if (isnan(demand[6])) {
+      slipid_step(&state, &reading, demand, dt, &estimate, command);
+    } else {
+      slipid_drive(&state, &reading, demand + 6, dt, &estimate, command);
+    }
     golden_said_of(&estimate, said);
     for (int k = 0; k < GOLDEN_SAID; ++k) {
       compare(golden_names[k], step, said[k], golden_said[step][k], golden_scale[k]);
     }
-    for (int k = 0; k < SLIPID_WHEELS; ++k) {
+    for (int k = 0; k < SLIPID_DRIVES; ++k) {
       compare("command", step, (double)command[k], golden_command[step][k], 1.0);
     }
   }
   printf("%d steps, %d numbers each: largest difference %.1e, allowed %.0e\n", GOLDEN_STEPS,
-         GOLDEN_SAID + SLIPID_WHEELS, worst, TOLERANCE);
+         GOLDEN_SAID + SLIPID_DRIVES, worst, TOLERANCE);
   return worst <= TOLERANCE ? 0 : 1;
 }

@@ -24,19 +24,19 @@ int main(void) {
   static slipid_state state;
   slipid_reading in;
   slipid_estimate estimate;
-  slipid_real pose[3], reference[6], command[SLIPID_WHEELS], dt;
+  slipid_real pose[3], reference[6], command[SLIPID_DRIVES], dt;
   if (!numbers(pose, 3)) {
     return 1;
   }
   slipid_init(&state, pose);
-  while (numbers(&dt, 1) && numbers(in.wheel_angle, SLIPID_WHEELS) &&
-         numbers(in.wheel_speed, SLIPID_WHEELS) && numbers(in.current, SLIPID_WHEELS) &&
-         numbers(in.voltage, SLIPID_WHEELS) && numbers(&in.gyro, 1) && numbers(in.fix, 3) &&
+  while (numbers(&dt, 1) && numbers(in.wheel_angle, SLIPID_DRIVES) &&
+         numbers(in.wheel_speed, SLIPID_DRIVES) && numbers(in.current, SLIPID_DRIVES) &&
+         numbers(in.voltage, SLIPID_DRIVES) && numbers(&in.gyro, 1) && numbers(in.fix, 3) &&
          numbers(in.fix_std, 2) && numbers(&in.fix_age, 1)) {
     slipid_observe(&state.estimator, &in, dt, &estimate);
     slipid_follow(&state.time, estimate.pose, dt, reference);
     slipid_command(&state.controller, reference, &estimate, dt, command);
-    for (int k = 0; k < SLIPID_WHEELS; ++k) {
+    for (int k = 0; k < SLIPID_DRIVES; ++k) {
       printf("%.*f ", DIGITS, (double)command[k]);
     }
     printf("%.*f\n", DIGITS, (double)state.time);

@@ -12,7 +12,7 @@ static const double golden_said[GOLDEN_STEPS][GOLDEN_SAID] = {
 @SAID@
 };
 
-static const double golden_command[GOLDEN_STEPS][SLIPID_WHEELS] = {
+static const double golden_command[GOLDEN_STEPS][SLIPID_DRIVES] = {
 @COMMAND@
 };
 

@@ -43,7 +43,7 @@ from slipid.predict.slip_model import RobotSpec
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, EstimatorState
 from slipid.robot.interface import Readings, Settings
-from slipid.robot.record import FloorRecord, LoadRecord, RobotRecord, Wheels
+from slipid.robot.record import FloorRecord, LoadRecord, RobotRecord, Setting, Wheels
 
 HIGHEST_A, HIGHEST_SPEED = 100.0, 20.0
 """Limits of plausible measurements in the robot record: motor current [A], wheel speed [rad/s]."""
@@ -76,7 +76,7 @@ def deployed(robot: Robot) -> DeployedRobot:
         loads=(load,),
         current_trend=(0.0, 0.0),
         highest_speed=HIGHEST_SPEED,
-        limits=assumed_limits(robot, HIGHEST_SPEED, HIGHEST_A),
+        limits=assumed_limits(robot, Setting(HIGHEST_SPEED), HIGHEST_A),
         draws={},
     )
     return DeployedRobot.of(record)
