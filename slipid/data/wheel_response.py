@@ -75,11 +75,11 @@ class WheelResponse:
 
 
 def wheel_response(logs: Sequence[Log], shape: Geometry) -> WheelResponse | None:
-    """Return the response of the wheels; None if the logs lack commands or do not determine it.
+    """Return the response of the wheels; None if logs lack commands or do not determine it.
 
     `shape` is the geometry by which a commanded twist becomes wheel speeds.
     """
-    if len(logs) < LEAST_RUNS:
+    if len(logs) < LEAST_RUNS or shape.driven is not None:
         return None
     some = np.unique(np.linspace(0, len(logs) - 1, MOST_RUNS).round().astype(int)).tolist()
     matrix, radius = np.asarray(shape.forward()), float(shape.wheel_radius)
@@ -95,7 +95,7 @@ def wheel_response(logs: Sequence[Log], shape: Geometry) -> WheelResponse | None
     point = _refined(model, best)
     if point is None:
         return None
-    delay, lag, acceleration = *point[:2].tolist(), float(np.exp(point[2]))
+    delay, lag, acceleration = float(point[0]), float(point[1]), float(np.exp(point[2]))
     jacobian, off = model.jacobian(point), model.residuals(point[None])[0]
     bread = np.linalg.pinv(np.einsum("prtw,qrtw->pq", jacobian, jacobian))
     scores = np.einsum("prtw,rtw->rp", jacobian, off)
@@ -105,8 +105,19 @@ def wheel_response(logs: Sequence[Log], shape: Geometry) -> WheelResponse | None
     if unexplained > MOST_UNEXPLAINED or std > LARGEST_STD_S or delay > LONGEST_DELAY_S:
         return None
     reach = INTERVAL_STDS * np.sqrt(np.diag(covariance))
-    ends = [(max(0.0, v - r), v + r) for v, r in zip((delay, lag), reach[:2].tolist(), strict=True)]
-    return WheelResponse(delay, lag, acceleration * radius, *ends, len(kept), unexplained)
+
+    def interval(value: float, half: float) -> tuple[float, float]:
+        return max(0.0, value - half), value + half
+
+    return WheelResponse(
+        delay,
+        lag,
+        acceleration * radius,
+        interval(delay, float(reach[0])),
+        interval(lag, float(reach[1])),
+        len(kept),
+        unexplained,
+    )
 
 
 @dataclass(frozen=True, eq=False)

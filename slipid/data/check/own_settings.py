@@ -46,7 +46,9 @@ STALE_GAPS, STALE_S = 5.0, (0.2, 1.0)
 
 
 def own_settings(logs: Sequence[Log], shape: Geometry) -> dict[str, float]:
-    """Return limits, noise and delays that logs show, keyed by path in robot.json, rounded to 3 digits.
+    """Return limits, noise and delays that logs show, rounded to 3 digits.
+
+    Keys are paths in robot.json.
 
     Args:
         logs: the runs; those without motion of wheels are ignored.
