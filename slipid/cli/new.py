@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 _WHEELS = "For omni, steered and general wheels"
 _BOX = "For mecanum and skid"
+_LIMITS = "Limits of a controller; by default those that the logs show"
 Text = str | None
 
 
@@ -40,6 +41,13 @@ def new(
     ticks_per_revolution: Annotated[
         Text, _text("Encoder ticks per motor turn; 0 if no ticks are logged.")
     ] = None,
+    speed_m_s: Annotated[Text, _text("Highest speed of the body.", _LIMITS)] = None,
+    yaw_rate_rad_s: Annotated[Text, _text("Highest yaw rate of the body.", _LIMITS)] = None,
+    acceleration_m_s2: Annotated[
+        Text, _text("Highest acceleration of the rim of a wheel.", _LIMITS)
+    ] = None,
+    wheel_speed_rad_s: Annotated[Text, _text("Highest speed of a wheel.", _LIMITS)] = None,
+    voltage_v: Annotated[Text, _text("Voltage of the supply.", _LIMITS)] = None,
     wheelbase_m: Annotated[
         Text, _text("Distance between front and rear axle; also for steered.", _BOX)
     ] = None,

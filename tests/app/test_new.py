@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import tomllib
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from slipid.app.config import geometry, parsed
+from slipid.app.config import geometry, given_settings, parsed
 from slipid.app.new.config_lines import QUESTION_MARK, ConfigLine, drawing
 from slipid.app.new.config_text import new_config
 from slipid.app.new.draft import template_draft
@@ -23,6 +24,13 @@ SIZES = {
     "gear_ratio": "12",
     "mass_kg": "20",
     "ticks_per_revolution": "512",
+}
+LIMITS = {
+    "speed_m_s": "1.5",
+    "yaw_rate_rad_s": "",
+    "acceleration_m_s2": "from the logs",
+    "wheel_speed_rad_s": "30",
+    "voltage_v": "",
 }
 BOX = {"wheelbase_m": "0.5", "track_m": "0.6"}
 CORNERS = [(0.25, 0.3), (0.25, -0.3), (-0.25, 0.3), (-0.25, -0.3)]
@@ -64,6 +72,7 @@ def refuse(*_: object) -> str:
 def test_wheels_stand_where_the_answers_place_them(drive):
     _, places, directions, drives = CASES[drive]
     told = {**CASES[drive][0], **SIZES, "drive": drive}
+    told |= {} if drive == "steered" else LIMITS
     config = new_config(template_draft(ask(told, refuse)), "mine.toml")
     content = parsed(Path("mine.toml"), config.text).content
     robot = geometry(content.robot)
@@ -74,6 +83,9 @@ def test_wheels_stand_where_the_answers_place_them(drive):
     assert robot.drives == drives
     assert float(robot.wheel_radius) == pytest.approx(0.08)
     assert (robot.gear_ratio, content.robot.mass_kg) == (12, 20)
+    limits = {} if drive == "steered" else {"limits.speed": 1.5, "limits.wheel_speed": 30.0}
+    assert given_settings(content.wheels) == limits
+    assert ("\n# voltage_v = 24 " in config.text) is (drive != "steered")
     layout = declared_layout(content.layouts["mine"], "mine")
     assert len(layout.channels["wheel_ticks"].columns) == drives
     assert (layout.ticks_per_revolution, layout.gear_ratio) == (512, 12)
@@ -128,6 +140,7 @@ def test_missing_answers_are_questions_in_the_file_and_in_the_list():
 def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
     said: list[tuple[str, str]] = []
     answers = iter(["skidd", "skid", "0.5", "-1", "wide", "0.6", "yes", "0.08", "1", "20", "0"])
+    answers = chain(answers, ["0", "2.5", "", "from the logs", "fast", "9", "48"])
 
     def asker(asks: str, default: str, wrong: str) -> str:
         said.append((asks.split(",")[0], wrong))
@@ -141,7 +154,14 @@ def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
         "'skidd': no such drive, did you mean skid?; "
         "expected one of omni, mecanum, skid, differential, steered, general"
     )
-    assert wrong[1:] == ["'-1': expected a number above 0", "'wide': expected a number"]
+    assert wrong[1:] == [
+        "'-1': expected a number above 0",
+        "'wide': expected a number",
+        "'0': expected a number above 0",
+        "'fast': expected a number",
+    ]
+    limits = (known.speed_m_s, known.yaw_rate_rad_s, known.acceleration_m_s2)
+    assert (*limits, known.wheel_speed_rad_s, known.voltage_v) == (2.5, None, None, 9.0, 48.0)
     assert not [asks for asks, _ in said if "azimuth" in asks or "stand" in asks]
 
 

@@ -43,10 +43,11 @@ def test_options_alone_ask_nothing(tmp_path):
 
 def test_questions_are_repeated_after_wrong_answers(tmp_path):
     out = tmp_path / "mine.toml"
-    result = answered("skid\n0.5\nwide\n0.6\nyes\n0.1\n1\n30\n0\n", "new", "--out", out)
+    result = answered("skid\n0.5\nwide\n0.6\nyes\n0.1\n1\n30\n0\n2\n\n\n\n\n", "new", "--out", out)
     assert result.exit_code == 0, result.stderr
     robot = read_config(out).content.robot
     assert (robot.half_length_m, robot.half_width_m, robot.drives) == (0.25, 0.3, [[1, 3], [2, 4]])
+    assert robot.limits.model_dump(exclude_none=True) == {"speed_m_s": 2.0}
     assert "'wide': expected a number" in result.stderr
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from slipid.app.config import LogsSection, OmniDrive, Wheels, geometry, parsed
+from slipid.app.config import LimitsSection, LogsSection, OmniDrive, Wheels, geometry, parsed
 from slipid.app.new.config_lines import ConfigBlock, ConfigLine, drawing, toml
 from slipid.app.new.draft import ConfigDraft, LogsDraft
 from slipid.app.new.robot_questions import robot_of
@@ -41,6 +41,14 @@ _QUESTIONS = {
     "driven": "default value: which axle's wheels have the encoders?",
     "encoders": "default value: has the driven axle one encoder or two?",
 }
+_EXAMPLE_LIMITS = {
+    "speed_m_s": 0.5,
+    "yaw_rate_rad_s": 1.0,
+    "acceleration_m_s2": 0.5,
+    "wheel_speed_rad_s": 10.0,
+    "voltage_v": 24.0,
+}
+"""Values in comments about limits that are not given."""
 _DATASHEET = (
     "no motor voltages are logged, so this parameter and the next keep these values: what are they "
     "in the datasheet?"
@@ -83,6 +91,26 @@ def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock
         comment = _ORDER[robot.drive] if key == "drive" else in_short(type(robot), key)
         lines.append(ConfigLine(key, toml(given[key]), comment, _open_question(draft, key)))
     return ConfigBlock("[robot]", tuple(lines), above=(*picture.splitlines(), "", FRAME))
+
+
+def _limits_block(robot: Wheels) -> ConfigBlock:
+    """Return the table `[robot.limits]`; limits that the logs are to show are comments."""
+    lines = []
+    for key, value in robot.limits:
+        lines.append(
+            ConfigLine(
+                key,
+                toml(_EXAMPLE_LIMITS[key] if value is None else value),
+                in_short(LimitsSection, key),
+                commented_out=value is None,
+            )
+        )
+    given = not all(line.commented_out for line in lines)
+    above = (
+        "Limits of a controller. Those without a value are the highest ones in the logs, which "
+        "`slipid check` prints, with the noise of the sensors for [robot.sensors].",
+    )
+    return ConfigBlock("[robot.limits]" if given else "# [robot.limits]", tuple(lines), above)
 
 
 def _open_question(draft: ConfigDraft, key: str) -> str:
@@ -177,6 +205,7 @@ def new_config(draft: ConfigDraft, name: str) -> NewConfig:
     blocks = [
         ConfigBlock("", above=_head(draft, name)),
         _robot_block(draft, robot, picture),
+        *([] if robot.drive == "steered" else [_limits_block(robot)]),
         *(block for layout in draft.layouts for block in layout.blocks()),
         *(_logs_block(logs, first=k == 0) for k, logs in enumerate(draft.logs)),
         _FIT,

@@ -41,6 +41,11 @@ class RobotAnswers:
     gear_ratio: float = 1.0
     mass_kg: float = 10.0
     ticks_per_revolution: float = 1000.0
+    speed_m_s: float | None = None
+    yaw_rate_rad_s: float | None = None
+    acceleration_m_s2: float | None = None
+    wheel_speed_rad_s: float | None = None
+    voltage_v: float | None = None
     defaults: frozenset[str] = field(default_factory=frozenset)
     """Names of the attributes that have a default value because there was no answer."""
 
@@ -62,6 +67,15 @@ def not_negative(text: str, _: RobotAnswers) -> float:
     if not 0 <= value < float("inf"):
         raise ValueError("expected a number above 0, or 0 where there is none")
     return value
+
+
+FROM_LOGS = "from the logs"
+"""Answer to a question about a limit that the logs are to show; an empty answer says the same."""
+
+
+def positive_if_any(text: str, answers: RobotAnswers) -> float | None:
+    """Return the number above 0 in an answer, or None if the logs are to show it."""
+    return None if text.strip() in ("", FROM_LOGS) else positive(text, answers)
 
 
 def number(text: str) -> float:
@@ -233,6 +247,27 @@ COMMON = (
         not_negative,
     ),
 )
+LIMITS = (
+    RobotQuestion(
+        "speed_m_s", "highest speed a controller may demand [m/s]", FROM_LOGS, positive_if_any
+    ),
+    RobotQuestion(
+        "yaw_rate_rad_s", "highest yaw rate it may demand [rad/s]", FROM_LOGS, positive_if_any
+    ),
+    RobotQuestion(
+        "acceleration_m_s2",
+        "highest acceleration of a wheel's rim [m/s^2]",
+        FROM_LOGS,
+        positive_if_any,
+    ),
+    RobotQuestion(
+        "wheel_speed_rad_s", "highest speed of a wheel [rad/s]", FROM_LOGS, positive_if_any
+    ),
+    RobotQuestion("voltage_v", "voltage of the supply [V]", FROM_LOGS, positive_if_any),
+)
+"""Questions about the limits of a controller, asked last; wheels that are steered have none."""
+_OPTIONAL = frozenset(question.name for question in (_WHEELS, *LIMITS))
+"""Names of the questions that need no answer where options answer all others."""
 DRIVES: dict[str, tuple[RobotQuestion, ...]] = {
     "omni": (_WHEELS, _AZIMUTHS, _BASE),
     "mecanum": (_WHEELBASE, _TRACK, _SHARED),
@@ -263,8 +298,11 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
     )
     counts = {"mecanum": 4, "skid": 4, "differential": 2}
     answers = replace(answers, wheels=counts.get(answers.drive, answers.wheels))
-    questions = (*DRIVES[answers.drive], *COMMON)
+    limits = () if answers.drive == "steered" else LIMITS
+    questions = (*DRIVES[answers.drive], *COMMON, *limits)
     _refuse_other_drives(options, answers.drive, questions)
+    if options.keys() >= {question.name for question in (DRIVE, *questions)} - _OPTIONAL:
+        asker = None  # options alone describe the robot, and the logs show its limits
     for question in questions:
         if question is _WHEELS and "azimuths_deg" in options and "wheels" not in options:
             answers = replace(answers, wheels=len(_parts(options["azimuths_deg"])))
@@ -337,6 +375,7 @@ def robot_of(answers: RobotAnswers) -> Wheels:
         own |= {"drives": [[1, 3], [2, 4]]} if answers.shared else {}
     for key in ("drive", "wheel_radius_m", "gear_ratio", "mass_kg"):
         own[key] = getattr(answers, key)
+    own["limits"] = {question.name: getattr(answers, question.name) for question in LIMITS}
     try:
         robot = _SECTION.validate_python(own)
         geometry(robot)
