@@ -309,13 +309,31 @@ def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()
 def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
     """Return the actuator model of a robot's twin, with the sensors that the robot's logs have.
 
-    Delay and lag are those of the robot if they are known; the twin's delay has an upper limit.
+    Wheels accelerate up to the robot's limit. The noise is what logs show, where they show it; a
+    config may have more, to be on the safe side. Delay and lag are those of the robot if they are
+    known; the twin's delay is limited to `LONGEST_DELAY_S`.
     """
     sensors, known = robot.record.sensors, known_actuator(robot)
-    model = ActuatorModel(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
+    noise = {name: getattr(sensors, own) for name, own in _NOISE.items()}
+    model = ActuatorModel(
+        slew=robot.record.limits.acceleration.value / float(robot.frame.radius),
+        voltage=sensors.voltage,
+        gyro=gyro,
+        signed=sensors.current_is_signed,
+        **{name: one.value for name, one in noise.items() if one.provenance == "logs"},
+    )
     if known is None:
         return model
     return replace(model, delay_s=min(known.delay_s, LONGEST_DELAY_S), lag_s=known.lag_s)
+
+
+_NOISE = {
+    "ammeter_a": "ammeter_std_a",
+    "voltmeter_v": "voltmeter_std_v",
+    "gyro_noise": "gyro_std",
+    "gyro_bias": "gyro_bias_std",
+}
+"""Name in robot.json of the noise of each sensor of an actuator model."""
 
 
 def _number(e: Estimate) -> RecordedNumber:
