@@ -26,6 +26,14 @@ def trial(
     plant: Annotated[
         str, option("NAME", "Simulated robot: testsite (MuJoCo), or twin (the fitted model).")
     ] = "testsite",
+    site: Annotated[
+        Path | None,
+        option(
+            "CONFIG",
+            "Config of slipid simulate that made the logs, whose robot the test site simulates; by "
+            "default the built-in robot with three omni wheels.",
+        ),
+    ] = None,
     map: Annotated[
         Path | None, option("FILE", "Floor map; by default patches of the fitted floors.")
     ] = None,
@@ -67,6 +75,7 @@ def trial(
 
     options = TrialOptions(
         plant=plant,
+        site=site,
         map=map,
         told_map=told_map,
         controllers=controller_names(controllers),

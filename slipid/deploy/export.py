@@ -8,6 +8,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.floor_map import read_map
@@ -50,6 +51,7 @@ class ExportOptions:
         path: name of the path that the example in C follows.
         speed: speed along the path [m/s].
         map: file of a floor map for a controller that uses one; None without a map.
+        recovery: whether a stuck robot tries to free itself; None to do so only with a gyro.
     """
 
     forms: Sequence[str] = FORMS
@@ -57,6 +59,7 @@ class ExportOptions:
     path: str = "rectangle"
     speed: float = 0.2
     map: Path | None = None
+    recovery: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,8 @@ def export(
     place = starts(20, floor, path)[0]
     start = (0.0, 0.0, 0.0) if options.map is None else place
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
+    if options.recovery is not None:
+        loop = eqx.tree_at(lambda x: x.controller.recovery, loop, jnp.asarray(options.recovery))
     path = path.moved(start).after_rest(REST_S)
     content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
     forms = tuple(form for form in FORMS if form in options.forms)

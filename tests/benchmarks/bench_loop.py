@@ -195,6 +195,7 @@ def driven(robot, row, path, steps=STEPS):
             command=np.asarray(said.command[k, :end]),
             estimate=said.estimate,
             energy=np.full(end, np.nan),
+            recovering=np.zeros(end, bool),
         )
         m = path_metrics(course)
         helpless = bool(said.gave_up[k, end - 1])

@@ -159,7 +159,7 @@ def _noise_of_meters(
             yield f"sensors.{name}", _std(parts, magnitudes)
 
 
-def _noise_of_gyro(rests: Sequence[Float[np.ndarray, " row"]]) -> Iterator[tuple[str, float]]:
+def _noise_of_gyro(rests: Sequence[Float[np.ndarray, "_"]]) -> Iterator[tuple[str, float]]:
     parts = [part for rest in rests if len(part := rest[np.isfinite(rest)]) > 2]
     std = _std(parts, magnitudes=False)
     yield "sensors.gyro_std", std
@@ -202,7 +202,7 @@ def _columns(
         yield column, new & np.isfinite(column)
 
 
-def _std(parts: Sequence[Float[np.ndarray, " reading"]], magnitudes: bool) -> float:
+def _std(parts: Sequence[Float[np.ndarray, "_"]], magnitudes: bool) -> float:
     """Return the std of noise around the mean of each part; nan if there are too few readings.
 
     Magnitudes of noise around 0 have their mean above 0, and count as readings around 0.
