@@ -32,6 +32,8 @@ ACCELERATION_MARGIN = 4.0
 """Ratio of the largest plausible acceleration of a wheel to that of a robot's commands [1]."""
 LEAST_ACCELERATION = 1.0
 """Smallest acceleration of a rim that is taken for that of a robot's commands here [m/s^2]."""
+PERIOD = 0.05
+"""Time between two commands [s]."""
 State = TypeVar("State", bound=eqx.Module)
 Some = TypeVar("Some", bound=eqx.Module)
 Scalar = Float[Array, ""] | float

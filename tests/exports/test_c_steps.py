@@ -11,8 +11,7 @@ import pytest
 
 from slipid.exports.c99.code import Code
 from slipid.exports.fields import attribute_docs
-from slipid.robot.closed_loop import PERIOD
-from slipid.robot.interface import Measurement
+from slipid.robot.interface import PERIOD, Measurement
 from slipid.robot.trajectory import rectangle
 from tests.helpers.c_against_jax import Batch, Source, differences, wander
 from tests.helpers.compiled_c import NEEDS_COMPILER, QUICK, CompiledC, code, put, worst
