@@ -29,8 +29,9 @@ from slipid.exports.folder import check_folder, check_writable, write_folder
 from slipid.exports.ros.folder import ros2_files
 from slipid.exports.stablehlo import load_program, stablehlo_files
 from slipid.robot import trajectory
-from slipid.robot.closed_loop import PERIOD, ControlLoop, run_closed_loop
+from slipid.robot.closed_loop import ControlLoop, run_closed_loop
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import PERIOD
 from slipid.robot.robot_file import robot_bytes
 from slipid.robot.twin import TwinPlant
 from slipid.support.errors import DataError, did_you_mean

@@ -22,9 +22,8 @@ from slipid.lab.testsite.site import Site
 from slipid.lab.trial.controllers import ROWS
 from slipid.lab.trial.trial import SitePlant
 from slipid.robot import closed_loop
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.interface import Measurement
+from slipid.robot.interface import PERIOD, Measurement
 from slipid.robot.trajectory import rectangle
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
