@@ -136,6 +136,10 @@ class SlipidNode : public rclcpp::Node {
     flag("stale", estimate.stale, DiagnosticStatus::WARN);
     flag("immobilised", estimate.immobilised, DiagnosticStatus::WARN);
     flag("out_of_range", estimate.out_of_range, DiagnosticStatus::WARN);
+    const char* const sensors[4] = {"gyro", "encoder", "current", "pose_fix"};
+    for (std::size_t k = 0; k < 4; ++k) {
+      add(std::string("rejected_") + sensors[k], std::to_string(static_cast<long>(estimate.rejected[k])));
+    }
     diagnostic_msgs::msg::DiagnosticArray m;
     m.header.stamp = time;
     m.status.push_back(status);
