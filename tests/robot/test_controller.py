@@ -163,7 +163,7 @@ def test_a_robot_that_turns_about_another_point_than_its_middle_does_not_turn_fo
         return float(controller._tangent_pose_loop(ref, jnp.zeros(3), gap, jnp.zeros(2))[2])
 
     assert [float(c._sideways()) for c in (skid, pair)] == pytest.approx([0.15, 0.0])
-    assert yaw_rate(skid, 0.17) == yaw_rate(pair, 0.02) == 0.0
+    assert [yaw_rate(skid, 0.17), yaw_rate(pair, 0.02)] == pytest.approx([0.0, 0.0], abs=1e-6)
     assert yaw_rate(skid, 0.24) < -1.0
     assert yaw_rate(pair, 0.17) < -1.0
 
