@@ -118,6 +118,7 @@ def export(
     path: str = "rectangle",
     speed: float = 0.2,
     map: Path | str | None = None,
+    recovery: bool | None = None,
 ) -> Exported:
     """Write a robot to a folder: robot.json, a README, checksums, and the exported forms.
 
@@ -132,11 +133,12 @@ def export(
         path: path that the example in C follows.
         speed: speed along the path [m/s].
         map: path of a floor map, which the controller `contact_map` needs.
+        recovery: whether a stuck robot tries to free itself; by default only with a gyro.
 
     Raises:
         DataError: there is no such form, controller or path, a step cannot be converted to C, or
             the folder has other files.
     """
     file = None if map is None else Path(map)
-    options = ExportOptions(tuple(to), controller, path, speed, map=file)
+    options = ExportOptions(tuple(to), controller, path, speed, map=file, recovery=recovery)
     return run(robot, Path(folder), options, Reporter(quiet=True), ROWS)

@@ -64,7 +64,8 @@ def trial(
 ) -> int:
     """Drive a simulated robot along a path with every controller, and compare their errors.
 
-    The gains are those set by hand, or the tuned gains of an older robot.json if these are better.
+    Gains are designed if robot.json has delay and lag of the wheels, else set by hand; the tuned
+    gains of an older robot.json are used if they are better than those set by hand.
     Writes trial.json and trial.png to OUT. Finished runs are kept and not simulated again.
     """
     from slipid.lab.trial.plots import trial_plot

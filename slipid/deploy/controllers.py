@@ -36,8 +36,7 @@ class ControllerRow:
         correction: torque correction of the 2021 paper, see `slipid.robot.controller.Controller`.
         law: function from a robot to a published control law that replaces the pose loop; None for
             the pose loop.
-        tuned: True to use the tuned gains of robot.json if they are better than the gains set by
-            hand.
+        tuned: True to use the gains of `Gains.of`, designed or tuned; False for gains set by hand.
         gyro: True if the robot has a gyro.
         mapped: True if the estimator uses a map of the site's floors.
         fixed: True if the robot is told its true pose.
@@ -91,8 +90,9 @@ CONTROLLERS: Mapping[str, ControllerRow] = {
         "curve", "slip odometry and the torque correction without its two errors", "torque"
     ),
     "contact": ControllerRow(
-        "contact", "contact estimator, with tuned gains if they are better", tuned=True
+        "contact", "contact estimator, gains designed if delay and lag are known", tuned=True
     ),
+    "contact_hand": ControllerRow("contact", "contact estimator, gains set by hand"),
     "contact_map": ControllerRow(
         "contact", "contact estimator with a map of the floors", tuned=True, mapped=True
     ),
@@ -113,9 +113,10 @@ def control_loop_of(
 ) -> ControlLoop[eqx.Module]:
     """Return the control loop of a row for a robot.
 
-    Tuned gains are used only if `row.tuned` is True, and only if they are better than the gains set
-    by hand or `forced` is True. `floor` is used only if `row.mapped` is True. `recovery` is True if
-    a stuck robot may try to free itself; None if the row has a gyro or the robot's logs have one.
+    The gains are those of `Gains.of` if `row.tuned` is True, else those set by hand; `forced` is
+    True to use tuned gains even if they are no better. `floor` is used if `row.mapped` is True.
+    `recovery` is True if a stuck robot may try to free itself; None if the row has a gyro or the
+    robot's logs have one.
 
     Raises:
         DataError: the row does not apply to the robot.

@@ -25,6 +25,7 @@ from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot.controller import NO_CONTROLLER
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.gains import known_actuator
 from slipid.robot.interface import MIXED_FLOORS_PENALTY
 from slipid.robot.record import (
     Axes,
@@ -43,7 +44,7 @@ from slipid.robot.record import (
     rows_of,
 )
 from slipid.robot.robot_file import typed
-from slipid.robot.twin import ActuatorModel
+from slipid.robot.twin import LONGEST_DELAY_S, ActuatorModel
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
@@ -317,17 +318,21 @@ def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
     """Return the actuator model of a robot's twin, with the sensors that the robot's logs have.
 
     Wheels accelerate up to the robot's limit. The noise is what logs show, where they show it; a
-    config may have more, to be on the safe side.
+    config may have more, to be on the safe side. Delay and lag are those of the robot if they are
+    known; the twin's delay is limited to `LONGEST_DELAY_S`.
     """
-    sensors = robot.record.sensors
+    sensors, known = robot.record.sensors, known_actuator(robot)
     noise = {name: getattr(sensors, own) for name, own in _NOISE.items()}
-    return ActuatorModel(
+    model = ActuatorModel(
         slew=robot.record.limits.acceleration.value / float(robot.frame.radius),
         voltage=sensors.voltage,
         gyro=gyro,
         signed=sensors.current_is_signed,
         **{name: one.value for name, one in noise.items() if one.provenance == "logs"},
     )
+    if known is None:
+        return model
+    return replace(model, delay_s=min(known.delay_s, LONGEST_DELAY_S), lag_s=known.lag_s)
 
 
 _NOISE = {

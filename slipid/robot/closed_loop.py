@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from slipid.parameter import as_numbers
 from slipid.robot.controller import Controller
 from slipid.robot.interface import (
+    PERIOD,
     AbstractEstimator,
     Measurement,
     Numbers,
@@ -23,8 +24,6 @@ from slipid.robot.interface import (
 from slipid.robot.supervision import ControllerState
 from slipid.robot.trajectory import Path
 
-PERIOD = 0.05
-"""Time between two commands [s]."""
 DURATION_FACTOR = 2.0
 """Largest duration of a run, as a multiple of the path's duration, to which 10 s are added [1]."""
 

@@ -17,8 +17,8 @@ and that of any other robot, with errors e in the body frame,
 Here p [m] and heading [rad] are the estimated pose, p_ref and heading_ref the reference pose, v_ref
 [m/s] and W_ref [rad/s] its rates, v [m/s] is the demanded velocity in the body frame, W [rad/s] the
 demanded yaw rate; k, k_yaw [1/s], g [1/m^2] and zeta [1] are gains, and R(-heading) rotates from
-world to body axes. A robot that cannot drive sideways and stands beside a resting reference first
-turns towards it.
+world to body axes. The lateral gain g falls with the speed, see `Gains.lateral_at`. A robot that
+cannot drive sideways and stands beside a resting reference first turns towards it.
 
 Source: Kanayama et al. 1990, ICRA; their damping vanishes at rest, which k_yaw prevents.
 
@@ -365,8 +365,9 @@ class Controller(eqx.Module):
         aside *= jnp.clip(1 - jnp.abs(speed) / BESIDE_SPEED, 0.0, 1.0)
         bearing = jnp.arctan2(left * jnp.where(ahead < 0, -1.0, 1.0), jnp.abs(ahead) + 1e-9)
         turn = (1 - aside) * off + aside * bearing
-        stiff = 2 * k.damping * jnp.sqrt(ref[5] ** 2 + k.lateral * speed**2 + 1e-12) + k.yaw
-        yaw_rate = ref[5] + k.lateral * speed * left + stiff * 2 * jnp.sin(0.5 * turn)
+        g = k.lateral_at(speed)
+        stiff = 2 * k.damping * jnp.sqrt(ref[5] ** 2 + g * speed**2 + 1e-12) + k.yaw
+        yaw_rate = ref[5] + g * speed * left + stiff * 2 * jnp.sin(0.5 * turn)
         v = speed * jnp.maximum(jnp.cos(off), 0.0) + k.place * ahead
         v += _rotated(integral, -pose[2])[0]
         return jnp.stack([v, jnp.zeros(()), yaw_rate])

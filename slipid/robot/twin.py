@@ -29,15 +29,15 @@ from jaxtyping import Array, Float
 from slipid.model.motor import sign_of_motion
 from slipid.model.se2 import advance, compose
 from slipid.parameter import as_numbers
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.effects import RolledMotion, effect_correlation, travel_direction
 from slipid.robot.filter.floor import Floor
-from slipid.robot.interface import Measurement, Pose, Readings
+from slipid.robot.interface import PERIOD, Measurement, Pose, Readings
 
 KEPT_COMMANDS = 6
-"""Number of commands that are kept, including the newest; the delay is at most `KEPT_COMMANDS` - 1
-periods."""
+"""Number of commands that are kept, including the newest."""
+LONGEST_DELAY_S = (KEPT_COMMANDS - 1) * PERIOD
+"""Longest delay of a twin [s]."""
 
 
 @dataclass(frozen=True)
@@ -146,11 +146,11 @@ class Twin(eqx.Module):
     actuators: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
-        """Raise `ValueError` for a delay below 0 or longer than the time of the kept commands."""
-        most = (KEPT_COMMANDS - 1) * PERIOD
-        if not 0 <= self.actuators.delay_s <= most:
+        """Raise `ValueError` for a delay below 0 or above `LONGEST_DELAY_S`."""
+        if not 0 <= self.actuators.delay_s <= LONGEST_DELAY_S:
             raise ValueError(
-                f"delay_s = {self.actuators.delay_s}; expected a delay from 0 to {most:g} s"
+                f"delay_s = {self.actuators.delay_s}; expected a delay from 0 to "
+                f"{LONGEST_DELAY_S:g} s"
             )
 
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:

@@ -22,9 +22,8 @@ from slipid.lab.testsite.site import Site
 from slipid.lab.trial.controllers import ROWS
 from slipid.lab.trial.trial import SitePlant
 from slipid.robot import closed_loop
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.interface import Measurement
+from slipid.robot.interface import PERIOD, Measurement
 from slipid.robot.trajectory import rectangle
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -189,3 +188,12 @@ def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, 
     monkeypatch.setattr(made, lambda *_, **__: pytest.fail("made"))
     with pytest.raises(DataError, match="files that an export did not write"):
         export(ROBOT, tmp_path, ExportOptions(), QUIET)
+
+
+@pytest.mark.slow
+def test_recovery_is_an_option_of_an_export(folder, tmp_path):
+    """It is off by default for a robot without a gyro."""
+    assert "recovery is off in this export" in (folder / "c/README.md").read_text()
+    options = ExportOptions(("c",), "slip_odometry", recovery=True)
+    export(ROBOT, tmp_path / "on", options, QUIET)
+    assert "recovery is off" not in (tmp_path / "on/c/README.md").read_text()

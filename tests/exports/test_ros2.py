@@ -16,7 +16,7 @@ from slipid.exports.ros.folder import ros2_files
 from slipid.exports.ros.yaml_text import scalar
 from slipid.exports.text import identifiers
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.gains import Gains
+from slipid.robot.gains import Gains, used_gains
 from slipid.robot.interface import Settings
 from slipid.robot.limits import Limits
 from tests.helpers.exported import LOADS, ODD, mecanum_robot
@@ -203,7 +203,7 @@ def test_gains_and_limits_are_those_of_the_controller(robot):
     for load in LOADS:
         made = DeployedRobot.of(robot.record, load)
         node = parameters(ros2_files(made), "slipid.yaml", "slipid")
-        gains = {name: float(x) for name, x in vars(Gains.of(made)).items()}
+        gains = {e.path: float(e.get(Gains.of(made))) for e in used_gains(made)}
         assert {name: node[f"gains.{name}"] for name in gains} == gains
         limits = vars(Limits())
         assert {name: node[f"limits.{name}"] for name in limits} == limits

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from slipid.exports.description import BASES, SETTINGS, gains_origin, settings, verdict_text
 from slipid.exports.ros.yaml_text import Check, Parameter
 from slipid.exports.text import identifiers, interval, listed
-from slipid.parameter import Entry, entries
+from slipid.parameter import Entry
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.gains import Gains
+from slipid.robot.gains import Gains, used_gains
 from slipid.robot.record import UNITS, RecordedNumber
 from slipid.robot.robot_file import declared_numbers
 
@@ -120,7 +120,7 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
 def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
     """Yield gains, limits and settings of sensors, which may be changed while the node runs."""
     gains = Gains.of(robot)
-    for e in entries(gains):
+    for e in used_gains(robot):
         about = f"{e.declaration.doc} {e.declaration.symbol} [{e.declaration.unit}]"
         if e.path == "place":
             about = f"{about}. {gains_origin(robot)}"

@@ -19,11 +19,11 @@ from slipid.lab.trial.published_laws import (
     by_swarm,
     inverse_kinematics,
 )
-from slipid.robot.closed_loop import PERIOD, Plant
+from slipid.robot.closed_loop import Plant
 from slipid.robot.controller import Law
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.gains import Gains
-from slipid.robot.interface import Measurement, Readings
+from slipid.robot.interface import PERIOD, Measurement, Readings
 from slipid.robot.limits import Limits
 from slipid.robot.trajectory import ROW_PERIOD, rectangle
 from slipid.robot.twin import ActuatorModel
@@ -154,12 +154,11 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if tuned is None:
         return ""
     if tuned.load != robot.load_setup:
-        return f"gains were tuned for load set-up {tuned.load}: driving with hand-set gains"
+        return f"gains were tuned for load set-up {tuned.load}: they are not used"
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
-            f"{tuned.loss.hand:.1f} mm): driving with gains set by hand; use --tuned-gains for "
-            "the tuned gains"
+            f"{tuned.loss.hand:.1f} mm) and not used; use --tuned-gains for the tuned gains"
         )
     if tuned.values.ahead.value == 0.0:
         return ""

@@ -602,7 +602,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
     assert unused_gains(tuned, forced=False) == ""
     other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
     assert values(Controller(other).gains) == values(Gains())
-    assert "tuned for load set-up far: driving with hand-set gains" in unused_gains(other, False)
+    assert "tuned for load set-up far: they are not used" in unused_gains(other, False)
     with pytest.raises(DataError, match=r"another load set-up \(far\), not for as_built; omit"):
         check_gains(tmp_path, other)
     with pytest.raises(DataError, match="the robot has no tuned gains; omit --tuned-gains"):
