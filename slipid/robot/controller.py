@@ -237,7 +237,9 @@ class Controller(eqx.Module):
             twist = self._free_pose_loop(ref, pose, k.place * gap + integral)
         else:
             twist = self._tangent_pose_loop(ref, pose, gap, integral)
-        return replace(state, integral=integral), jnp.where(usable, twist, jnp.nan)
+        pursues = jnp.ones((), bool)
+        state = replace(state, integral=integral, pursues=pursues)
+        return state, jnp.where(usable, twist, jnp.nan)
 
     def drive(
         self,
@@ -284,7 +286,7 @@ class Controller(eqx.Module):
         a = 1 - jnp.exp(-dt / OBSERVER_S)
         miss = old.miss + a * (now.twist - old.wanted - old.miss)
         demand = wanted - k.observer * miss
-        wheels = self._wheel_speeds(demand, e) + self._torque(wanted, e)
+        wheels = self._wheel_speeds(demand, e, old.pursues) + self._torque(wanted, e)
         # a small speed shows whether drives that were off turn again
         most = jnp.max(jnp.abs(wheels))
         slower = jnp.where(new.drives_off, jnp.minimum(probe / jnp.maximum(most, 1e-9), 1.0), 1.0)
@@ -295,10 +297,11 @@ class Controller(eqx.Module):
         new = replace(
             new,
             command=command,
-            integral=jnp.where(new.drives_off, 0.0, old.integral),
+            integral=jnp.where(old.pursues & ~new.drives_off, old.integral, 0.0),
             wanted=jnp.where(moves, demand, 0.0),
             miss=jnp.where(moves & ~new.drives_off, jnp.clip(miss, -0.2, 0.2), 0.0),
             limited=~moves | (jnp.max(jnp.abs(command - wheels)) >= 0.05),
+            pursues=jnp.zeros((), bool),
             begun=jnp.ones((), bool),
         )
         return new, command
@@ -307,13 +310,19 @@ class Controller(eqx.Module):
         """Return whether the estimate and the demand can be used."""
         return e.finite & jnp.all(jnp.isfinite(demand)) & ~e.stale
 
-    def _wheel_speeds(self, twist: Array, e: StateEstimate) -> Float[Array, " drive"]:
+    def _wheel_speeds(
+        self, twist: Array, e: StateEstimate, pursues: Bool[Array, ""]
+    ) -> Float[Array, " drive"]:
         """Return the wheel speeds that move the body with a twist on the floors believed [rad/s].
 
-        On an unknown floor the wheels are assumed to roll without slip.
+        On an unknown floor the wheels are assumed to roll without slip. So are those of a robot
+        that can drive sideways and pursues a reference: its pose loop corrects slip by itself, and
+        compensation by a belief about floors that may be wrong does not bring it nearer.
         """
         f = self.robot
         under = f.on_average(e.surface_probability[:, :-1].T)
+        if f.holonomic:
+            under = jnp.where(pursues, 0.0, under)
         rolling = f.forward @ twist / f.frame.radius
         slipping = jnp.sum(under * (f.inverse_kinematics @ twist), axis=0)
         wheels = slipping + (1 - jnp.sum(under, axis=0)) * rolling
