@@ -70,7 +70,8 @@ RESPONSE_S = 0.15
 """Delay and lag, together, of wheels whose actuators are unknown [s]."""
 BESIDE_M, BESIDE_SPEED = (0.03, 0.08), 0.05
 """Distances beside the reference between which a robot that cannot drive sideways begins to turn
-towards it [m], and speed of the reference from which on it does not [m/s]; half the distance between the axles is added to the distances."""
+towards it [m], and speed of the reference from which on it does not [m/s]; half the distance
+between the axles is added to the distances."""
 
 
 def limit_command(

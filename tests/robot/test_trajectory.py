@@ -136,7 +136,7 @@ def test_a_path_waits_for_a_lag_and_not_for_a_tolerated_distance_to_the_side():
     here = np.asarray(path.at(now))[:3]
 
     def waited(x, y):
-        later, _ = path.follow(now, jnp.asarray(here + [x, y, 0.0]), 0.05, 0.0, 0.2, 0.1)
+        later, _ = path.follow(now, jnp.asarray(here) + jnp.array([x, y, 0.0]), 0.05, 0.0, 0.2, 0.1)
         return 1.0 - float(later - now) / 0.05
 
     assert waited(0.0, 0.1) == waited(0.0, -0.09) == pytest.approx(0.0)
