@@ -45,8 +45,10 @@ LARGEST_STEP = np.array([0.05, 0.1, 0.5])
 largest step of the search."""
 MOST_UNEXPLAINED = 0.2
 """Largest fraction of the square of the measured speeds that the model may leave [1]."""
-LARGEST_STD_S = 0.03
-"""Largest std of the sum of delay and lag with which it counts as known [s]."""
+LARGEST_STD_S, LARGEST_STD = 0.03, 0.15
+"""Delay and lag count as known if the std of their sum is below either of these [s], or [1] as a
+fraction of the sum; at this fraction the phase of a loop with a margin of 60 degrees is wrong by at
+most 4.5 degrees."""
 INTERVAL_STDS = 1.645
 """Half width of an interval of 90 % [std]."""
 
@@ -102,7 +104,8 @@ def wheel_response(logs: Sequence[Log], shape: Geometry) -> WheelResponse | None
     covariance = bread @ (scores.T @ scores) @ bread * len(kept) / (len(kept) - 1)
     unexplained = float((off**2).sum() / (model.measured**2).sum())
     std = float(np.sqrt(covariance[:2, :2].sum()))
-    if unexplained > MOST_UNEXPLAINED or std > LARGEST_STD_S or delay > LONGEST_DELAY_S:
+    most = max(LARGEST_STD_S, LARGEST_STD * (delay + lag))
+    if unexplained > MOST_UNEXPLAINED or std > most or delay > LONGEST_DELAY_S:
         return None
     reach = INTERVAL_STDS * np.sqrt(np.diag(covariance))
 

@@ -70,7 +70,8 @@ RESPONSE_S = 0.15
 """Delay and lag, together, of wheels whose actuators are unknown [s]."""
 BESIDE_M, BESIDE_SPEED = (0.03, 0.08), 0.05
 """Distances beside the reference between which a robot that cannot drive sideways begins to turn
-towards it [m], and speed of the reference from which on it does not [m/s]."""
+towards it [m], and speed of the reference from which on it does not [m/s]; half the distance
+between the axles is added to the distances."""
 
 
 def limit_command(
@@ -188,7 +189,7 @@ class Controller(eqx.Module):
         """
         here = jnp.where(jnp.isfinite(pose), pose, 1e3)
         arm = 0.0 if self.robot.holonomic else HEADING_ARM_M
-        return path.follow(time, here, dt, self.gains.preview, arm)
+        return path.follow(time, here, dt, self.gains.preview, arm, self._sideways())
 
     def step(
         self,
@@ -237,7 +238,9 @@ class Controller(eqx.Module):
             twist = self._free_pose_loop(ref, pose, k.place * gap + integral)
         else:
             twist = self._tangent_pose_loop(ref, pose, gap, integral)
-        return replace(state, integral=integral), jnp.where(usable, twist, jnp.nan)
+        pursues = jnp.ones((), bool)
+        state = replace(state, integral=integral, pursues=pursues)
+        return state, jnp.where(usable, twist, jnp.nan)
 
     def drive(
         self,
@@ -284,7 +287,7 @@ class Controller(eqx.Module):
         a = 1 - jnp.exp(-dt / OBSERVER_S)
         miss = old.miss + a * (now.twist - old.wanted - old.miss)
         demand = wanted - k.observer * miss
-        wheels = self._wheel_speeds(demand, e) + self._torque(wanted, e)
+        wheels = self._wheel_speeds(demand, e, old.pursues) + self._torque(wanted, e)
         # a small speed shows whether drives that were off turn again
         most = jnp.max(jnp.abs(wheels))
         slower = jnp.where(new.drives_off, jnp.minimum(probe / jnp.maximum(most, 1e-9), 1.0), 1.0)
@@ -295,10 +298,11 @@ class Controller(eqx.Module):
         new = replace(
             new,
             command=command,
-            integral=jnp.where(new.drives_off, 0.0, old.integral),
+            integral=jnp.where(old.pursues & ~new.drives_off, old.integral, 0.0),
             wanted=jnp.where(moves, demand, 0.0),
             miss=jnp.where(moves & ~new.drives_off, jnp.clip(miss, -0.2, 0.2), 0.0),
             limited=~moves | (jnp.max(jnp.abs(command - wheels)) >= 0.05),
+            pursues=jnp.zeros((), bool),
             begun=jnp.ones((), bool),
         )
         return new, command
@@ -307,13 +311,19 @@ class Controller(eqx.Module):
         """Return whether the estimate and the demand can be used."""
         return e.finite & jnp.all(jnp.isfinite(demand)) & ~e.stale
 
-    def _wheel_speeds(self, twist: Array, e: StateEstimate) -> Float[Array, " drive"]:
+    def _wheel_speeds(
+        self, twist: Array, e: StateEstimate, pursues: Bool[Array, ""]
+    ) -> Float[Array, " drive"]:
         """Return the wheel speeds that move the body with a twist on the floors believed [rad/s].
 
-        On an unknown floor the wheels are assumed to roll without slip.
+        On an unknown floor the wheels are assumed to roll without slip. So are those of a robot
+        that can drive sideways and pursues a reference: its pose loop corrects slip by itself, and
+        compensation by a belief about floors that may be wrong does not bring it nearer.
         """
         f = self.robot
         under = f.on_average(e.surface_probability[:, :-1].T)
+        if f.holonomic:
+            under = jnp.where(pursues, 0.0, under)
         rolling = f.forward @ twist / f.frame.radius
         slipping = jnp.sum(under * (f.inverse_kinematics @ twist), axis=0)
         wheels = slipping + (1 - jnp.sum(under, axis=0)) * rolling
@@ -332,6 +342,17 @@ class Controller(eqx.Module):
             over = jnp.max(over)
         return wanted / jnp.maximum(over, 1.0)
 
+    def _sideways(self) -> Float[Array, ""]:
+        """Return how far a turn may move the middle of a robot that cannot drive sideways [m].
+
+        Such a robot turns about a point that depends on the floors under its wheels, but lies
+        between its axles. It corrects the distance to the side while it drives on.
+        """
+        if self.robot.holonomic:
+            return jnp.zeros(())
+        ahead = self.robot.places[:, 0]
+        return 0.5 * (jnp.max(ahead) - jnp.min(ahead))
+
     def _free_pose_loop(self, ref: Array, pose: Array, pull: Array) -> Array:
         """Return the twist demanded of a robot that can drive sideways [m/s, m/s, rad/s].
 
@@ -349,7 +370,7 @@ class Controller(eqx.Module):
         along = ref[3] * jnp.cos(ref[2]) + ref[4] * jnp.sin(ref[2])
         speed = jnp.where(along < 0, -1.0, 1.0) * jnp.sqrt(ref[3:5] @ ref[3:5] + 1e-18)
         # beside a resting reference the robot first turns towards it, or away to drive in reverse
-        near, far = BESIDE_M
+        near, far = (m + self._sideways() for m in BESIDE_M)
         aside = jnp.clip((jnp.abs(_rotated(gap, -ref[2])[1]) - near) / (far - near), 0.0, 1.0)
         aside *= jnp.clip(1 - jnp.abs(speed) / BESIDE_SPEED, 0.0, 1.0)
         bearing = jnp.arctan2(left * jnp.where(ahead < 0, -1.0, 1.0), jnp.abs(ahead) + 1e-9)

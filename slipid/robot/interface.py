@@ -98,7 +98,7 @@ class Settings(eqx.Module):
         """
         record = with_record(robot).record
         acceleration, voltage = record.limits.acceleration.value, record.limits.voltage
-        radius = float(np.mean(robot.frame.radius))
+        radius = robot.frame.radius
         supply = cls.supply_voltage if voltage.provenance == "assumed" else voltage.value
         parts = vars(record.sensors).items()
         known = {name: part.value for name, part in parts if isinstance(part, Setting)}

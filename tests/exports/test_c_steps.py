@@ -113,7 +113,7 @@ def test_every_field_has_a_unit():
     plain = {f.name for s in code("contact").structs for f in s.fields if f.about.endswith("[1]")}
     assert plain == {
         *("floors_belief", "floors_expected", "place_toward", "begun", "slip"),
-        *("drives_off", "gave_up", "limited"),
+        *("drives_off", "gave_up", "limited", "pursues"),
         *("surface_probability", "stale", "immobilised", "out_of_range", "rejected"),
         *("wheels_rejected", "refused", "gyro_rejected"),
         *("place_fixes_agreeing", "place_fixes_rejected"),
