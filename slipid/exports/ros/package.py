@@ -9,8 +9,8 @@ from slipid.exports.description import header
 from slipid.exports.ros.drive import joint
 from slipid.exports.ros.localization import UNKNOWN
 from slipid.exports.text import filled
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import PERIOD
 
 MESSAGES = (
     "diagnostic_msgs",
