@@ -70,7 +70,8 @@ RESPONSE_S = 0.15
 """Delay and lag, together, of wheels whose actuators are unknown [s]."""
 BESIDE_M, BESIDE_SPEED = (0.03, 0.08), 0.05
 """Distances beside the reference between which a robot that cannot drive sideways begins to turn
-towards it [m], and speed of the reference from which on it does not [m/s]."""
+towards it [m], and speed of the reference from which on it does not [m/s]; half the distance
+between the axles is added to the distances."""
 
 
 def limit_command(
@@ -188,7 +189,7 @@ class Controller(eqx.Module):
         """
         here = jnp.where(jnp.isfinite(pose), pose, 1e3)
         arm = 0.0 if self.robot.holonomic else HEADING_ARM_M
-        return path.follow(time, here, dt, self.gains.preview, arm)
+        return path.follow(time, here, dt, self.gains.preview, arm, self._sideways())
 
     def step(
         self,
@@ -341,6 +342,17 @@ class Controller(eqx.Module):
             over = jnp.max(over)
         return wanted / jnp.maximum(over, 1.0)
 
+    def _sideways(self) -> Float[Array, ""]:
+        """Return how far a turn may move the middle of a robot that cannot drive sideways [m].
+
+        Such a robot turns about a point that depends on the floors under its wheels, but lies
+        between its axles. It corrects the distance to the side while it drives on.
+        """
+        if self.robot.holonomic:
+            return jnp.zeros(())
+        ahead = self.robot.places[:, 0]
+        return 0.5 * (jnp.max(ahead) - jnp.min(ahead))
+
     def _free_pose_loop(self, ref: Array, pose: Array, pull: Array) -> Array:
         """Return the twist demanded of a robot that can drive sideways [m/s, m/s, rad/s].
 
@@ -358,7 +370,7 @@ class Controller(eqx.Module):
         along = ref[3] * jnp.cos(ref[2]) + ref[4] * jnp.sin(ref[2])
         speed = jnp.where(along < 0, -1.0, 1.0) * jnp.sqrt(ref[3:5] @ ref[3:5] + 1e-18)
         # beside a resting reference the robot first turns towards it, or away to drive in reverse
-        near, far = BESIDE_M
+        near, far = (m + self._sideways() for m in BESIDE_M)
         aside = jnp.clip((jnp.abs(_rotated(gap, -ref[2])[1]) - near) / (far - near), 0.0, 1.0)
         aside *= jnp.clip(1 - jnp.abs(speed) / BESIDE_SPEED, 0.0, 1.0)
         bearing = jnp.arctan2(left * jnp.where(ahead < 0, -1.0, 1.0), jnp.abs(ahead) + 1e-9)

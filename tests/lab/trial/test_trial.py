@@ -474,9 +474,8 @@ def test_the_site_has_the_robot_of_a_config(deployed):
 def test_rows_that_suit_a_robot_without_sideways_motion():
     skid = deploy_known(build(skid_steer(0.13, 0.19, 0.1, drive_of=(0, 1, 0, 1)), ["firm"]))
     kept = applicable(tuple(ROWS), skid)
-    assert kept == (
-        *("encoder", "contact", "contact_hand", "contact_map", "contact_gyro", "true_pose"),
-    )
+    rows = ("encoder", "contact", "contact_hand", "contact_map", "contact_gyro", "true_pose")
+    assert kept == rows
     for name in ("slip_odometry", "torque", "indiveri", "goswami_padhy"):
         with pytest.raises(DataError, match=f"{name}: only for robots .* one of encoder, contact"):
             applicable((name,), skid)
