@@ -54,8 +54,8 @@ class NumberRow:
     Attributes:
         group: key of the table to which the row belongs.
         name: name of the number; for a parameter, its path in robot.json.
-        entry: wheel to which the number belongs, such as "wheel 2"; empty for a number of the whole
-            robot.
+        entry: wheel or drive to which the number belongs, such as "wheel 2"; empty for a number of
+            the whole robot.
         symbol: symbol in equations.
         value: value [unit].
         unit: unit of the value.
@@ -94,8 +94,8 @@ def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     for e in declared_numbers(robot.record):
         number, d, group = robot.record.parameters[e.path], e.declaration, e.path.partition(".")[0]
         ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2)).tolist()
-        for k, value in enumerate(np.ravel(number.value).tolist()):
-            entry = f"wheel {k + 1}" if isinstance(number.value, tuple) else ""
+        values = np.ravel(number.value).tolist()
+        for k, (value, entry) in enumerate(zip(values, e.labels or ("",), strict=True)):
             about = (d.symbol, value, d.unit, (ends[k][0], ends[k][1]) if ends else None)
             sure = (verdict_text(number.verdict), number.provenance, d.doc)
             yield NumberRow(group, e.path, entry, *about, *sure)
@@ -336,24 +336,30 @@ def _matrix_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     known = robot.record.parameters
     made_of = [f"{path} ({verdict_text(known[path].verdict)})" for path in _GEOMETRY]
     sure = ("derived", f"from {', '.join(made_of)}")
-    for k in range(robot.wheels):
+    each = _drives(robot)
+    for k, drive in enumerate(each):
         for axis, (name, unit) in enumerate(_TWIST):
             about = ("J", float(robot.forward[k, axis]), f"m/s per {unit}", None, *sure)
-            meaning = f"rim speed of wheel {k + 1} per {name}"
+            meaning = f"rim speed of {drive} per {name}"
             yield NumberRow("forward", f"forward[{k + 1}]", name, *about, meaning)
     for axis, (name, unit) in enumerate(_TWIST):
-        for k in range(robot.wheels):
+        for k, drive in enumerate(each):
             about = ("J^+", float(robot.inverse[axis, k]), f"{unit} per m/s", None, *sure)
-            meaning = f"{name} per rim speed of wheel {k + 1}"
-            yield NumberRow("inverse", f"inverse[{name}]", f"wheel {k + 1}", *about, meaning)
+            meaning = f"{name} per rim speed of {drive}"
+            yield NumberRow("inverse", f"inverse[{name}]", drive, *about, meaning)
 
 
 def _curve_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     columns = (("a", "1", "slip ratio without current"), ("b", "1/A", "slip ratio per current"))
-    for k, row in enumerate(robot.wheel_curve.tolist()):
+    for drive, row in zip(_drives(robot), robot.wheel_curve.tolist(), strict=True):
         for value, (name, unit, meaning) in zip(row, columns, strict=True):
             about = (name, value, unit, None, "derived", _FITTED, meaning)
-            yield NumberRow("wheel_curve", f"wheel_curve.{name}", f"wheel {k + 1}", *about)
+            yield NumberRow("wheel_curve", f"wheel_curve.{name}", drive, *about)
+
+
+def _drives(robot: DeployedRobot) -> list[str]:
+    """Return the names of the drives, which are the wheels unless motors drive several wheels."""
+    return [f"{'drive' if robot.drive_of else 'wheel'} {k + 1}" for k in range(robot.drives)]
 
 
 def _as_csv(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
