@@ -239,7 +239,7 @@ def with_record(robot: RobotArrays) -> DeployedRobot:
     if not isinstance(robot, DeployedRobot):
         raise ValueError(
             "this robot has arrays but no record; expected a DeployedRobot, or explicit settings "
-            "and gains for the estimator and controller"
+            "for the estimator, and gains and limits for the controller"
         )
     return robot
 

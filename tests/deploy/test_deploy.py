@@ -111,7 +111,8 @@ def test_gains_of_an_older_file_outlive_the_same_numbers_and_are_driven_with(fit
     assert read_robot(out).record == tuned
     del found["ahead"]
     own = {name: float(gain) for name, gain in vars(Gains.of(read_robot(out))).items()}
-    for words, gains in (((), own), (("--tuned-gains",), found)):
+    tuned_too = {**{name: float(gain) for name, gain in vars(Gains()).items()}, **found}
+    for words, gains in (((), own), (("--tuned-gains",), tuned_too)):
         done = invoke("trial", out, *TRIAL, *words)
         assert done.exit_code == 0, done.output
         assert json.loads((out / "trial.json").read_text())["gains"] == gains

@@ -194,4 +194,4 @@ def test_arrays_alone_have_no_settings_and_no_gains(robots):
     assert steps(Estimator(robots[0].arrays, ONE))[0] == pytest.approx(
         steps(Estimator(robots[0], ONE))[0], abs=0.0
     )
-    assert Controller(robots[0].arrays, Gains()).init().command.shape == (3,)
+    assert Controller(robots[0].arrays, Gains(), Limits()).init().command.shape == (3,)
