@@ -310,13 +310,15 @@ class Controller(eqx.Module):
     def _wheel_speeds(self, twist: Array, e: StateEstimate) -> Float[Array, " drive"]:
         """Return the wheel speeds that move the body with a twist on the floors believed [rad/s].
 
-        On an unknown floor the wheels are assumed to roll without slip.
+        The matrices of the floors are averaged over the belief under all wheels: how much a wheel
+        slips depends on its own floor and on the drag that the floors of the others cause. On an
+        unknown floor the wheels are assumed to roll without slip.
         """
         f = self.robot
-        under = f.on_average(e.surface_probability[:, :-1].T)
+        under = jnp.mean(e.surface_probability[:, :-1], axis=0)
+        slipping = jnp.sum(under[:, None] * (f.inverse_kinematics @ twist), axis=0)
         rolling = f.forward @ twist / f.frame.radius
-        slipping = jnp.sum(under * (f.inverse_kinematics @ twist), axis=0)
-        wheels = slipping + (1 - jnp.sum(under, axis=0)) * rolling
+        wheels = slipping + (1 - jnp.sum(under)) * rolling
         return jnp.where(jnp.isfinite(wheels), wheels, 0.0)
 
     def _limited_twist(self, wanted: Array) -> Float[Array, "3"]:
