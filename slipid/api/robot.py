@@ -18,7 +18,7 @@ from slipid.deploy.twin_run import (
     twin_floor,
     twin_plant,
 )
-from slipid.lab.trial.controllers import ROWS
+from slipid.lab.trial.controllers import ROWS, TruePosePlant
 from slipid.robot import closed_loop
 from slipid.robot.controller import NO_CONTROLLER
 from slipid.robot.deployed import DeployedRobot
@@ -98,7 +98,10 @@ def drive(
             "start from 0 to 19"
         )
     row, begin = ROWS[controller], places[start]
+    plant: closed_loop.Plant
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
+    if row.fixed:
+        plant = TruePosePlant(plant)
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
     driven = closed_loop.run_closed_loop(
         loop, reference.moved(begin).after_rest(REST_S), plant, begin
@@ -115,6 +118,7 @@ def export(
     path: str = "rectangle",
     speed: float = 0.2,
     map: Path | str | None = None,
+    recovery: bool | None = None,
 ) -> Exported:
     """Write a robot to a folder: robot.json, a README, checksums, and the exported forms.
 
@@ -129,11 +133,12 @@ def export(
         path: path that the example in C follows.
         speed: speed along the path [m/s].
         map: path of a floor map, which the controller `contact_map` needs.
+        recovery: whether a stuck robot tries to free itself; by default only with a gyro.
 
     Raises:
         DataError: there is no such form, controller or path, a step cannot be converted to C, or
             the folder has other files.
     """
     file = None if map is None else Path(map)
-    options = ExportOptions(tuple(to), controller, path, speed, map=file)
+    options = ExportOptions(tuple(to), controller, path, speed, map=file, recovery=recovery)
     return run(robot, Path(folder), options, Reporter(quiet=True), ROWS)

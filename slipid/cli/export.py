@@ -38,6 +38,13 @@ def export(
     map: Annotated[
         Path | None, option("FILE", "Floor map, for the controller contact_map.")
     ] = None,
+    recovery: Annotated[
+        bool | None,
+        typer.Option(
+            "--recovery/--no-recovery",
+            help="Whether a stuck robot tries to free itself; by default only with a gyro.",
+        ),
+    ] = None,
     check: Annotated[
         bool, flag("--check", "Only check that the files of an exported folder are unchanged.")
     ] = False,
@@ -73,7 +80,7 @@ def export(
     with Reporter(quiet=quiet) as report:
         report.stage("reading the robot")
         robot = read_robot(source, load, _names(floors))
-        options = ExportOptions(_names(to), controller, path, speed, map)
+        options = ExportOptions(_names(to), controller, path, speed, map, recovery)
         done = run(robot, out, options, report, ROWS)
     content = {"schema": "slipid.export/1", **asdict(done), "folder": str(done.folder)}
     emit(json, content, lambda page: show_export(page, done))

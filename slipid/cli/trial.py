@@ -26,6 +26,14 @@ def trial(
     plant: Annotated[
         str, option("NAME", "Simulated robot: testsite (MuJoCo), or twin (the fitted model).")
     ] = "testsite",
+    site: Annotated[
+        Path | None,
+        option(
+            "CONFIG",
+            "Config of slipid simulate that made the logs, whose robot the test site simulates; by "
+            "default the built-in robot with three omni wheels.",
+        ),
+    ] = None,
     map: Annotated[
         Path | None, option("FILE", "Floor map; by default patches of the fitted floors.")
     ] = None,
@@ -56,7 +64,8 @@ def trial(
 ) -> int:
     """Drive a simulated robot along a path with every controller, and compare their errors.
 
-    The gains are those set by hand, or the tuned gains of an older robot.json if these are better.
+    Gains are designed if robot.json has delay and lag of the wheels, else set by hand; the tuned
+    gains of an older robot.json are used if they are better than those set by hand.
     Writes trial.json and trial.png to OUT. Finished runs are kept and not simulated again.
     """
     from slipid.lab.trial.plots import trial_plot
@@ -66,6 +75,7 @@ def trial(
 
     options = TrialOptions(
         plant=plant,
+        site=site,
         map=map,
         told_map=told_map,
         controllers=controller_names(controllers),

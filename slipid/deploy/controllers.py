@@ -6,7 +6,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
+from slipid.parameter import as_numbers
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Correction, Law
 from slipid.robot.deployed import DeployedRobot
@@ -14,6 +17,7 @@ from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
 from slipid.robot.gains import Gains
 from slipid.robot.interface import AbstractEstimator, Settings
+from slipid.robot.record import Rows
 from slipid.support.errors import DataError
 
 PAPER_WHEELS = 3
@@ -25,16 +29,17 @@ class ControllerRow:
     """A combination of estimator and controller.
 
     Attributes:
-        observer: estimator: `encoder` (odometry without slip), `curve` (odometry with each wheel's
-            slip computed from its current) or `contact` (`slipid.Estimator`).
+        observer: estimator: `encoder` (odometry with the lengths of the config, without slip),
+            `calibrated` (odometry with calibrated lengths, the mean over floors), `curve` (odometry
+            with each wheel's slip computed from its current) or `contact` (`slipid.Estimator`).
         about: description for people, in the output of `slipid trial`.
         correction: torque correction of the 2021 paper, see `slipid.robot.controller.Controller`.
         law: function from a robot to a published control law that replaces the pose loop; None for
             the pose loop.
-        tuned: True to use the tuned gains of robot.json if they are better than the gains set by
-            hand.
+        tuned: True to use the gains of `Gains.of`, designed or tuned; False for gains set by hand.
         gyro: True if the robot has a gyro.
         mapped: True if the estimator uses a map of the site's floors.
+        fixed: True if the robot is told its true pose.
     """
 
     observer: str
@@ -44,19 +49,36 @@ class ControllerRow:
     tuned: bool = False
     gyro: bool = False
     mapped: bool = False
+    fixed: bool = False
 
-    def drives(self, robot: DeployedRobot) -> bool:
-        """Return whether the row applies to a robot.
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the row needs besides encoders and ammeters: "gyro", "map", "true pose"."""
+        parts = {"gyro": self.gyro, "map": self.mapped, "true pose": self.fixed}
+        return tuple(name for name, needed in parts.items() if needed)
 
-        Torque corrections have gains only for robots with three omni wheels.
+    def obstacle(self, robot: DeployedRobot) -> str:
+        """Return why the row does not apply to a robot; empty if it applies.
+
+        Published laws and slip curves are for robots that can drive sideways, and torque
+        corrections have gains only for three omni wheels.
         """
-        if self.correction == "none":
-            return True
-        return robot.holonomic and robot.wheels == PAPER_WHEELS
+        if self.correction != "none" and not (robot.holonomic and robot.wheels == PAPER_WHEELS):
+            return f"only for robots with {PAPER_WHEELS} wheels, like that of the 2021 paper"
+        if (self.law is not None or self.observer == "curve") and not robot.holonomic:
+            return "only for robots that can drive sideways"
+        if self.observer == "calibrated" and not _calibrations(robot):
+            return "robot.json has no calibration; write it again with `slipid identify`"
+        return ""
 
 
 CONTROLLERS: Mapping[str, ControllerRow] = {
     "encoder": ControllerRow("encoder", "odometry from encoders, without slip"),
+    "calibrated": ControllerRow(
+        "calibrated",
+        "odometry from encoders with calibrated lengths (effective track and radius)",
+        tuned=True,
+    ),
     "slip_odometry": ControllerRow("curve", "odometry corrected by slip over current (figure 5)"),
     "paper_print": ControllerRow(
         "curve", "slip odometry and the torque correction as printed", "paper_print"
@@ -68,8 +90,9 @@ CONTROLLERS: Mapping[str, ControllerRow] = {
         "curve", "slip odometry and the torque correction without its two errors", "torque"
     ),
     "contact": ControllerRow(
-        "contact", "contact estimator, with tuned gains if they are better", tuned=True
+        "contact", "contact estimator, gains designed if delay and lag are known", tuned=True
     ),
+    "contact_hand": ControllerRow("contact", "contact estimator, gains set by hand"),
     "contact_map": ControllerRow(
         "contact", "contact estimator with a map of the floors", tuned=True, mapped=True
     ),
@@ -86,27 +109,46 @@ def control_loop_of(
     settings: Settings | None = None,
     forced: bool = False,
     floor: Floor | None = None,
+    recovery: bool | None = None,
 ) -> ControlLoop[eqx.Module]:
     """Return the control loop of a row for a robot.
 
-    Tuned gains are used only if `row.tuned` is True, and only if they are better than the gains set
-    by hand or `forced` is True. `floor` is used only if `row.mapped` is True.
+    The gains are those of `Gains.of` if `row.tuned` is True, else those set by hand; `forced` is
+    True to use tuned gains even if they are no better. `floor` is used if `row.mapped` is True.
+    `recovery` is True if a stuck robot may try to free itself; None if the row has a gyro or the
+    robot's logs have one.
 
     Raises:
-        DataError: the row does not apply to the robot's wheels.
+        DataError: the row does not apply to the robot.
     """
-    if not row.drives(robot):
-        raise DataError(
-            f"the torque correction of the 2021 paper has gains for {PAPER_WHEELS} wheels, but "
-            f"this robot has {robot.wheels}; expected a controller without torque correction"
-        )
+    if obstacle := row.obstacle(robot):
+        raise DataError(f"{row.about}: {obstacle}; expected another controller")
+    if row.observer == "encoder" and robot.record.nominal is not None:
+        robot = _rolling_by(robot, np.array(robot.record.nominal))
+    if row.observer == "calibrated":
+        robot = _rolling_by(robot, np.mean(_calibrations(robot), axis=0))
     gains = Gains.of(robot, forced) if row.tuned else Gains()
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
+    if row.observer in ("encoder", "curve"):
         gains = replace(gains, preview=jnp.asarray(0.0))  # the 2021 paper's loop has no preview
+    if recovery is None and row.gyro:
+        recovery = True
     law = None if row.law is None else row.law(robot)
-    controller = Controller(
-        robot, gains, correction=row.correction, law=law, recovery=row.gyro or None
-    )
+    controller = Controller(robot, gains, correction=row.correction, law=law, recovery=recovery)
     return ControlLoop(estimator, controller)
+
+
+def _calibrations(robot: DeployedRobot) -> list[Rows]:
+    """Return the calibrated kinematics of the floors that have them."""
+    return [floor.calibration for floor in robot.record.floors if floor.calibration is not None]
+
+
+def _rolling_by(robot: DeployedRobot, to_twist: Float[np.ndarray, "3 drive"]) -> DeployedRobot:
+    """Return a robot whose wheels roll without slip by a matrix from wheel speeds to twist."""
+    radius, axes = robot.frame.radius, [0, 1, 2] if robot.holonomic else [0, 2]
+    to_wheels = np.zeros(to_twist.T.shape)
+    to_wheels[:, axes] = np.linalg.pinv(to_twist[axes])
+    forward, inverse = radius * as_numbers(to_wheels), as_numbers(to_twist) / radius
+    return replace(robot, forward=forward, inverse=inverse)

@@ -25,6 +25,7 @@ from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot.controller import NO_CONTROLLER
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.gains import known_actuator
 from slipid.robot.interface import MIXED_FLOORS_PENALTY
 from slipid.robot.record import (
     Axes,
@@ -34,14 +35,16 @@ from slipid.robot.record import (
     Pair,
     RecordedNumber,
     RobotRecord,
+    Rows,
     Setting,
     Source,
     SteeringRecord,
     axes_of,
     plain,
+    rows_of,
 )
 from slipid.robot.robot_file import typed
-from slipid.robot.twin import ActuatorModel
+from slipid.robot.twin import LONGEST_DELAY_S, ActuatorModel
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
@@ -105,7 +108,7 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
 def with_kinematics(
     record: RobotRecord, found: Calibration, shape: Geometry, models: Mapping[str, str]
 ) -> RobotRecord:
-    """Return the record with calibrated kinematics on the floors where they were selected.
+    """Return the record with calibrated kinematics, in use on floors where they were selected.
 
     Args:
         record: record of the force balance.
@@ -115,23 +118,28 @@ def with_kinematics(
             with the lengths of the config.
     """
     rolling, one = np.asarray(shape.pseudo_inverse()), float(shape.wheel_radius)
+
+    def rows(floor: str, calibrated: bool) -> tuple[Rows, float]:
+        *radius, base, centre = found.numbers(floor)[: shape.drives + 2] * calibrated
+        matrix = matrices(rolling, one * np.exp(radius), np.exp(base), np.asarray(centre))
+        return rows_of(matrix), float(np.exp(base))
+
     floors, spread = list(record.floors), {}
     for k, floor in enumerate(record.floors):
+        floors[k] = replace(floor, calibration=rows(floor.name, True)[0])
         model = models.get(floor.name, "contact")
         if model == "contact":
             continue
         # floors share their steering, so that a robot that steers has calibrated kinematics on all
         whole = model == "calibrated" or shape.driven is not None
-        *radius, base, centre = found.numbers(floor.name)[: shape.drives + 2] * whole
-        matrix = matrices(rolling, one * np.exp(radius), np.exp(base), np.asarray(centre))
-        rows = tuple(tuple(float(x) for x in row) for row in matrix)
+        kinematics, base_ratio = rows(floor.name, whole)
         effect = found.noise.effect[floor.name]
         floors[k] = replace(
-            floor,
-            kinematics=(rows[0], rows[1], rows[2]),
+            floors[k],
+            kinematics=kinematics,
             process=found.noise.process[floor.name],
             effect=effect,
-            wheelbase=found.nominal_base * float(np.exp(base)) if shape.driven else None,
+            wheelbase=found.nominal_base * base_ratio if shape.driven else None,
         )
         # what uncertain lengths do per metre: a radius to the distance, radii and base to the yaw
         std = max(v.std / v.value for v in found.radius[floor.name])
@@ -142,7 +150,8 @@ def with_kinematics(
     if found.steering:
         names = ("zero_rad", "gain", "understeer")
         steering = SteeringRecord(*(found.steering[name].value for name in names))
-    return replace(record, floors=tuple(floors), loads=loads, steering=steering)
+    nominal = rows_of(rolling * one)
+    return replace(record, floors=tuple(floors), loads=loads, steering=steering, nominal=nominal)
 
 
 def _without_effects(
@@ -309,17 +318,21 @@ def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
     """Return the actuator model of a robot's twin, with the sensors that the robot's logs have.
 
     Wheels accelerate up to the robot's limit. The noise is what logs show, where they show it; a
-    config may have more, to be on the safe side.
+    config may have more, to be on the safe side. Delay and lag are those of the robot if they are
+    known; the twin's delay is limited to `LONGEST_DELAY_S`.
     """
-    sensors = robot.record.sensors
+    sensors, known = robot.record.sensors, known_actuator(robot)
     noise = {name: getattr(sensors, own) for name, own in _NOISE.items()}
-    return ActuatorModel(
+    model = ActuatorModel(
         slew=robot.record.limits.acceleration.value / float(robot.frame.radius),
         voltage=sensors.voltage,
         gyro=gyro,
         signed=sensors.current_is_signed,
         **{name: one.value for name, one in noise.items() if one.provenance == "logs"},
     )
+    if known is None:
+        return model
+    return replace(model, delay_s=min(known.delay_s, LONGEST_DELAY_S), lag_s=known.lag_s)
 
 
 _NOISE = {

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.floor_map import read_map
@@ -28,8 +29,9 @@ from slipid.exports.folder import check_folder, check_writable, write_folder
 from slipid.exports.ros.folder import ros2_files
 from slipid.exports.stablehlo import load_program, stablehlo_files
 from slipid.robot import trajectory
-from slipid.robot.closed_loop import PERIOD, ControlLoop, run_closed_loop
+from slipid.robot.closed_loop import ControlLoop, run_closed_loop
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import PERIOD
 from slipid.robot.robot_file import robot_bytes
 from slipid.robot.twin import TwinPlant
 from slipid.support.errors import DataError, did_you_mean
@@ -49,6 +51,7 @@ class ExportOptions:
         path: name of the path that the example in C follows.
         speed: speed along the path [m/s].
         map: file of a floor map for a controller that uses one; None without a map.
+        recovery: whether a stuck robot tries to free itself; None to do so only with a gyro.
     """
 
     forms: Sequence[str] = FORMS
@@ -56,6 +59,7 @@ class ExportOptions:
     path: str = "rectangle"
     speed: float = 0.2
     map: Path | None = None
+    recovery: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,8 @@ def export(
     place = starts(20, floor, path)[0]
     start = (0.0, 0.0, 0.0) if options.map is None else place
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
+    if options.recovery is not None:
+        loop = eqx.tree_at(lambda x: x.controller.recovery, loop, jnp.asarray(options.recovery))
     path = path.moved(start).after_rest(REST_S)
     content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
     forms = tuple(form for form in FORMS if form in options.forms)

@@ -16,9 +16,8 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 
 from slipid.exports.text import filled, interval, listed, one_line, short, table, wrapped
-from slipid.parameter import entries
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.gains import Gains
+from slipid.robot.gains import DesignedGains, Gains, used_gains
 from slipid.robot.record import UNITS, Basis, Pair, Provenance, Setting, Source, Verdict
 from slipid.robot.robot_file import declared_numbers
 
@@ -55,8 +54,8 @@ class NumberRow:
     Attributes:
         group: key of the table to which the row belongs.
         name: name of the number; for a parameter, its path in robot.json.
-        entry: wheel to which the number belongs, such as "wheel 2"; empty for a number of the whole
-            robot.
+        entry: wheel or drive to which the number belongs, such as "wheel 2"; empty for a number of
+            the whole robot.
         symbol: symbol in equations.
         value: value [unit].
         unit: unit of the value.
@@ -95,8 +94,8 @@ def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     for e in declared_numbers(robot.record):
         number, d, group = robot.record.parameters[e.path], e.declaration, e.path.partition(".")[0]
         ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2)).tolist()
-        for k, value in enumerate(np.ravel(number.value).tolist()):
-            entry = f"wheel {k + 1}" if isinstance(number.value, tuple) else ""
+        values = np.ravel(number.value).tolist()
+        for k, (value, entry) in enumerate(zip(values, e.labels or ("",), strict=True)):
             about = (d.symbol, value, d.unit, (ends[k][0], ends[k][1]) if ends else None)
             sure = (verdict_text(number.verdict), number.provenance, d.doc)
             yield NumberRow(group, e.path, entry, *about, *sure)
@@ -154,20 +153,37 @@ def settings_origin(robot: DeployedRobot) -> str:
 
 def gains_origin(robot: DeployedRobot) -> str:
     """Return sentences about the origin of a robot's gains and limits."""
-    limits = settings_origin(robot)
-    tuned = robot.record.gains
-    if tuned is None:
-        return f"Gains set by hand. {limits}"
-    if tuned.load != robot.load_setup:
-        load = one_line(tuned.load)
-        return f"Gains set by hand; the tuned gains are for the load set-up {load}. {limits}"
-    if not tuned.is_better:
-        return f"Gains set by hand; the tuned gains are {tuned.verdict}. {limits}"
-    loss = f"loss {tuned.loss.tuned:.1f} mm, by hand {tuned.loss.hand:.1f} mm"
-    gyro = "with a gyro" if tuned.gyro else "without a gyro"
+    return f"{gains_sentence(robot)} {settings_origin(robot)}"
+
+
+def gains_sentence(robot: DeployedRobot) -> str:
+    """Return a sentence about the origin of a robot's gains, with the margins of designed ones."""
+    tuned, found = robot.record.gains, DesignedGains.of(robot)
+    if tuned is not None and tuned.load == robot.load_setup and tuned.is_better:
+        loss = f"loss {tuned.loss.tuned:.1f} mm, by hand {tuned.loss.hand:.1f} mm"
+        gyro = "with a gyro" if tuned.gyro else "without a gyro"
+        return (
+            f"Gains tuned on the twin {gyro}, better than the gains set by hand in simulated runs "
+            f"({loss})."
+        )
+    why = ""
+    if tuned is not None and tuned.load != robot.load_setup:
+        why = f"; the tuned gains are for the load set-up {one_line(tuned.load)}"
+    elif tuned is not None:
+        why = f"; the tuned gains are {tuned.verdict}"
+    if found is None:
+        return f"Gains set by hand, since delay and lag of the wheels are unknown{why}."
+    loops = listed(
+        [
+            f"{name} loop with a phase margin of {one.margin_deg:.0f} deg and a bandwidth of "
+            f"{one.bandwidth_hz:.2g} Hz"
+            for name, one in found.loops.items()
+        ]
+    )
+    a = found.actuator
     return (
-        f"Gains tuned on the twin {gyro}, better than the gains set by hand in simulated runs "
-        f"({loss}). {limits}"
+        f"Gains designed for wheels with a delay of {a.delay_s:.2g} s and a lag of "
+        f"{a.lag_s:.2g} s: {loops}{why}."
     )
 
 
@@ -216,7 +232,7 @@ def warnings(robot: DeployedRobot) -> tuple[str, ...]:
 
 
 def _sentences(robot: DeployedRobot) -> Iterator[str]:
-    """Yield sentences about source, floors, load set-ups and verdicts."""
+    """Yield sentences about source, floors, load set-ups, verdicts and gains."""
     record = robot.record
     yield f"Made by slipid {made_with()} from robot.json; export it again instead of editing it."
     yield f"Hash of the parameters: {record.numbers} (`numbers` in robot.json)."
@@ -227,6 +243,7 @@ def _sentences(robot: DeployedRobot) -> Iterator[str]:
     counts = Counter(record.parameters[e.path].verdict for e in declared_numbers(record))
     listing = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
     yield f"Verdicts: {listing}."
+    yield gains_sentence(robot)
 
 
 def made_with() -> str:
@@ -302,8 +319,11 @@ def _table_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
 def _gain_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     gains, tuned = Gains.of(robot), robot.record.gains
     taken = tuned is not None and tuned.is_better and tuned.load == robot.load_setup
-    sure = ("tuned, better than set by hand", "robot.json") if taken else ("by hand", "default")
-    for e in entries(gains):
+    designed = DesignedGains.of(robot)
+    sure = ("by hand", "default") if designed is None else ("designed", "from delay and lag")
+    if taken:
+        sure = ("tuned, better than set by hand", "robot.json")
+    for e in used_gains(robot):
         d = e.declaration
         # gains that a robot was not tuned for have their values set by hand
         one = getattr(tuned.values, e.path, None) if tuned is not None and taken else None
@@ -316,24 +336,30 @@ def _matrix_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     known = robot.record.parameters
     made_of = [f"{path} ({verdict_text(known[path].verdict)})" for path in _GEOMETRY]
     sure = ("derived", f"from {', '.join(made_of)}")
-    for k in range(robot.wheels):
+    each = _drives(robot)
+    for k, drive in enumerate(each):
         for axis, (name, unit) in enumerate(_TWIST):
             about = ("J", float(robot.forward[k, axis]), f"m/s per {unit}", None, *sure)
-            meaning = f"rim speed of wheel {k + 1} per {name}"
+            meaning = f"rim speed of {drive} per {name}"
             yield NumberRow("forward", f"forward[{k + 1}]", name, *about, meaning)
     for axis, (name, unit) in enumerate(_TWIST):
-        for k in range(robot.wheels):
+        for k, drive in enumerate(each):
             about = ("J^+", float(robot.inverse[axis, k]), f"{unit} per m/s", None, *sure)
-            meaning = f"{name} per rim speed of wheel {k + 1}"
-            yield NumberRow("inverse", f"inverse[{name}]", f"wheel {k + 1}", *about, meaning)
+            meaning = f"{name} per rim speed of {drive}"
+            yield NumberRow("inverse", f"inverse[{name}]", drive, *about, meaning)
 
 
 def _curve_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
     columns = (("a", "1", "slip ratio without current"), ("b", "1/A", "slip ratio per current"))
-    for k, row in enumerate(robot.wheel_curve.tolist()):
+    for drive, row in zip(_drives(robot), robot.wheel_curve.tolist(), strict=True):
         for value, (name, unit, meaning) in zip(row, columns, strict=True):
             about = (name, value, unit, None, "derived", _FITTED, meaning)
-            yield NumberRow("wheel_curve", f"wheel_curve.{name}", f"wheel {k + 1}", *about)
+            yield NumberRow("wheel_curve", f"wheel_curve.{name}", drive, *about)
+
+
+def _drives(robot: DeployedRobot) -> list[str]:
+    """Return the names of the drives, which are the wheels unless motors drive several wheels."""
+    return [f"{'drive' if robot.drive_of else 'wheel'} {k + 1}" for k in range(robot.drives)]
 
 
 def _as_csv(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:

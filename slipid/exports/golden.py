@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.robot.closed_loop import PERIOD, ControlLoop
-from slipid.robot.interface import Measurement, Readings, StateEstimate
+from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.interface import PERIOD, Measurement, Readings, StateEstimate
 from slipid.robot.supervision import ControllerState
 
 GOLDEN_STEPS = 48

@@ -169,13 +169,13 @@ def show_trial(page: Page, found: Content, out: Path) -> None:
             f"{row['heading_error_deg']:.1f} deg",
         )
     page.table(made)
-    best = found["closes_best"]
-    if best is None:
-        page.line(
-            f"no significant difference with these starts: {', '.join(found['not_told_apart'])}"
-        )
-    else:
-        page.line(f"smallest closure error: {best} ({found['controllers'][best]})")
+    page.line(found["verdict"])
+    for name, row in found["summary"].items():
+        if row["recovery_share"]:
+            page.line(
+                f"{name}: tried to free itself in {100 * row['recovery_share']:.0f} % of the runs, "
+                f"and drove on in {100 * row['freed_share']:.0f} % of these"
+            )
     count = min(row["runs"] for row in found["summary"].values())
     page.line("worse: share of the starts with a larger closure error than that of encoders")
     page.line(f"medians of {count} starts; 90 % intervals and every run: {out / 'trial.json'}")

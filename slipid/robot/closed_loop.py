@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from slipid.parameter import as_numbers
 from slipid.robot.controller import Controller
 from slipid.robot.interface import (
+    PERIOD,
     AbstractEstimator,
     Measurement,
     Numbers,
@@ -23,8 +24,6 @@ from slipid.robot.interface import (
 from slipid.robot.supervision import ControllerState
 from slipid.robot.trajectory import Path
 
-PERIOD = 0.05
-"""Time between two commands [s]."""
 DURATION_FACTOR = 2.0
 """Largest duration of a run, as a multiple of the path's duration, to which 10 s are added [1]."""
 
@@ -139,6 +138,7 @@ class ClosedLoopRun:
         command: commanded wheel speeds [rad/s].
         estimate: outputs of the estimator; every array has a leading axis of steps.
         energy: energy used by the motors so far [J]; NaN if the plant does not provide it.
+        recovering: True while the controller tries to free a robot that is stuck.
     """
 
     path: Path
@@ -148,6 +148,7 @@ class ClosedLoopRun:
     command: Float[np.ndarray, "step wheel"]
     estimate: StateEstimate
     energy: Float[np.ndarray, " step"]
+    recovering: Bool[np.ndarray, " step"]
 
     @property
     def estimated_pose(self) -> Float[np.ndarray, "step 3"]:
@@ -175,17 +176,18 @@ def run_closed_loop(
     """
     drives = loop.controller.robot.drives
     state, reading, dt = loop.init(start), plant.reset().filled(drives), jnp.asarray(PERIOD)
-    rows: list[tuple[float, float, tuple[float, float, float], ControlLoopOutput]] = []
+    rows: list[tuple[float, float, bool, tuple[float, float, float], ControlLoopOutput]] = []
     energy, path_time, time = 0.0, 0.0, 0.0
     gave_up, longest = False, DURATION_FACTOR * path.duration + 10.0
     while path_time < path.duration - 1e-6 and time < longest and not gave_up:
         state, out = _step(loop, path, state, reading, dt)
         path_time, gave_up = float(out.time), bool(out.gave_up)
-        rows.append((time, energy, plant.pose, out))
+        recovers = float(state.controller.tried) > 0
+        rows.append((time, energy, recovers, plant.pose, out))
         reading = plant.step(np.asarray(out.command)).filled(drives)
         energy += getattr(plant, "power", np.nan) * PERIOD
         time += PERIOD
-    times, energies, poses, outputs = zip(*rows, strict=True)
+    times, energies, recovering, poses, outputs = zip(*rows, strict=True)
     run: ControlLoopOutput = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *outputs)
     pose = np.array(poses)
     pose[:, 2] = np.unwrap(pose[:, 2])
@@ -197,6 +199,7 @@ def run_closed_loop(
         command=np.asarray(run.command),
         estimate=run.estimate,
         energy=np.array(energies),
+        recovering=np.array(recovering),
     )
 
 
@@ -228,6 +231,8 @@ class PathMetrics:
         effort: root mean square change of the commanded wheel speeds per period [rad/s].
         seconds: duration of the run [s].
         finished: True if the path ran to its end within the run.
+        recoveries: number of times that the controller began to free a robot that was stuck.
+        freed: number of these times after which the robot drove on.
     """
 
     along_track_mm: tuple[float, ...]
@@ -240,6 +245,8 @@ class PathMetrics:
     effort: float
     seconds: float
     finished: bool
+    recoveries: int
+    freed: int
 
 
 def path_metrics(run: ClosedLoopRun) -> PathMetrics:
@@ -266,4 +273,6 @@ def path_metrics(run: ClosedLoopRun) -> PathMetrics:
         effort=float(np.sqrt((np.diff(run.command, axis=0) ** 2).mean())),
         seconds=float(run.time[-1]),
         finished=bool(run.path_time[-1] >= path.duration - 1e-6),
+        recoveries=int(np.sum(np.diff(run.recovering.astype(int), prepend=0) > 0)),
+        freed=int(np.sum(np.diff(run.recovering.astype(int)) < 0)),
     )

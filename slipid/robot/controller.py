@@ -17,8 +17,8 @@ and that of any other robot, with errors e in the body frame,
 Here p [m] and heading [rad] are the estimated pose, p_ref and heading_ref the reference pose, v_ref
 [m/s] and W_ref [rad/s] its rates, v [m/s] is the demanded velocity in the body frame, W [rad/s] the
 demanded yaw rate; k, k_yaw [1/s], g [1/m^2] and zeta [1] are gains, and R(-heading) rotates from
-world to body axes. A robot that cannot drive sideways and stands beside a resting reference first
-turns towards it.
+world to body axes. The lateral gain g falls with the speed, see `Gains.lateral_at`. A robot that
+cannot drive sideways and stands beside a resting reference first turns towards it.
 
 Source: Kanayama et al. 1990, ICRA; their damping vanishes at rest, which k_yaw prevents.
 
@@ -70,7 +70,8 @@ RESPONSE_S = 0.15
 """Delay and lag, together, of wheels whose actuators are unknown [s]."""
 BESIDE_M, BESIDE_SPEED = (0.03, 0.08), 0.05
 """Distances beside the reference between which a robot that cannot drive sideways begins to turn
-towards it [m], and speed of the reference from which on it does not [m/s]."""
+towards it [m], and speed of the reference from which on it does not [m/s]; half the distance
+between the axles is added to the distances."""
 
 
 def limit_command(
@@ -188,7 +189,7 @@ class Controller(eqx.Module):
         """
         here = jnp.where(jnp.isfinite(pose), pose, 1e3)
         arm = 0.0 if self.robot.holonomic else HEADING_ARM_M
-        return path.follow(time, here, dt, self.gains.preview, arm)
+        return path.follow(time, here, dt, self.gains.preview, arm, self._sideways())
 
     def step(
         self,
@@ -237,7 +238,9 @@ class Controller(eqx.Module):
             twist = self._free_pose_loop(ref, pose, k.place * gap + integral)
         else:
             twist = self._tangent_pose_loop(ref, pose, gap, integral)
-        return replace(state, integral=integral), jnp.where(usable, twist, jnp.nan)
+        pursues = jnp.ones((), bool)
+        state = replace(state, integral=integral, pursues=pursues)
+        return state, jnp.where(usable, twist, jnp.nan)
 
     def drive(
         self,
@@ -284,7 +287,7 @@ class Controller(eqx.Module):
         a = 1 - jnp.exp(-dt / OBSERVER_S)
         miss = old.miss + a * (now.twist - old.wanted - old.miss)
         demand = wanted - k.observer * miss
-        wheels = self._wheel_speeds(demand, e) + self._torque(wanted, e)
+        wheels = self._wheel_speeds(demand, e, old.pursues) + self._torque(wanted, e)
         # a small speed shows whether drives that were off turn again
         most = jnp.max(jnp.abs(wheels))
         slower = jnp.where(new.drives_off, jnp.minimum(probe / jnp.maximum(most, 1e-9), 1.0), 1.0)
@@ -295,10 +298,11 @@ class Controller(eqx.Module):
         new = replace(
             new,
             command=command,
-            integral=jnp.where(new.drives_off, 0.0, old.integral),
+            integral=jnp.where(old.pursues & ~new.drives_off, old.integral, 0.0),
             wanted=jnp.where(moves, demand, 0.0),
             miss=jnp.where(moves & ~new.drives_off, jnp.clip(miss, -0.2, 0.2), 0.0),
             limited=~moves | (jnp.max(jnp.abs(command - wheels)) >= 0.05),
+            pursues=jnp.zeros((), bool),
             begun=jnp.ones((), bool),
         )
         return new, command
@@ -307,15 +311,21 @@ class Controller(eqx.Module):
         """Return whether the estimate and the demand can be used."""
         return e.finite & jnp.all(jnp.isfinite(demand)) & ~e.stale
 
-    def _wheel_speeds(self, twist: Array, e: StateEstimate) -> Float[Array, " drive"]:
+    def _wheel_speeds(
+        self, twist: Array, e: StateEstimate, pursues: Bool[Array, ""]
+    ) -> Float[Array, " drive"]:
         """Return the wheel speeds that move the body with a twist on the floors believed [rad/s].
 
         The matrices of the floors are averaged over the belief under all wheels: how much a wheel
         slips depends on its own floor and on the drag that the floors of the others cause. On an
-        unknown floor the wheels are assumed to roll without slip.
+        unknown floor the wheels are assumed to roll without slip. So are those of a robot that can
+        drive sideways and pursues a reference: its pose loop corrects slip by itself, and
+        compensation by a belief about floors that may be wrong does not bring it nearer.
         """
         f = self.robot
         under = jnp.mean(e.surface_probability[:, :-1], axis=0)
+        if f.holonomic:
+            under = jnp.where(pursues, 0.0, under)
         slipping = jnp.sum(under[:, None] * (f.inverse_kinematics @ twist), axis=0)
         rolling = f.forward @ twist / f.frame.radius
         wheels = slipping + (1 - jnp.sum(under)) * rolling
@@ -334,6 +344,17 @@ class Controller(eqx.Module):
             over = jnp.max(over)
         return wanted / jnp.maximum(over, 1.0)
 
+    def _sideways(self) -> Float[Array, ""]:
+        """Return how far a turn may move the middle of a robot that cannot drive sideways [m].
+
+        Such a robot turns about a point that depends on the floors under its wheels, but lies
+        between its axles. It corrects the distance to the side while it drives on.
+        """
+        if self.robot.holonomic:
+            return jnp.zeros(())
+        ahead = self.robot.places[:, 0]
+        return 0.5 * (jnp.max(ahead) - jnp.min(ahead))
+
     def _free_pose_loop(self, ref: Array, pose: Array, pull: Array) -> Array:
         """Return the twist demanded of a robot that can drive sideways [m/s, m/s, rad/s].
 
@@ -351,13 +372,14 @@ class Controller(eqx.Module):
         along = ref[3] * jnp.cos(ref[2]) + ref[4] * jnp.sin(ref[2])
         speed = jnp.where(along < 0, -1.0, 1.0) * jnp.sqrt(ref[3:5] @ ref[3:5] + 1e-18)
         # beside a resting reference the robot first turns towards it, or away to drive in reverse
-        near, far = BESIDE_M
+        near, far = (m + self._sideways() for m in BESIDE_M)
         aside = jnp.clip((jnp.abs(_rotated(gap, -ref[2])[1]) - near) / (far - near), 0.0, 1.0)
         aside *= jnp.clip(1 - jnp.abs(speed) / BESIDE_SPEED, 0.0, 1.0)
         bearing = jnp.arctan2(left * jnp.where(ahead < 0, -1.0, 1.0), jnp.abs(ahead) + 1e-9)
         turn = (1 - aside) * off + aside * bearing
-        stiff = 2 * k.damping * jnp.sqrt(ref[5] ** 2 + k.lateral * speed**2 + 1e-12) + k.yaw
-        yaw_rate = ref[5] + k.lateral * speed * left + stiff * 2 * jnp.sin(0.5 * turn)
+        g = k.lateral_at(speed)
+        stiff = 2 * k.damping * jnp.sqrt(ref[5] ** 2 + g * speed**2 + 1e-12) + k.yaw
+        yaw_rate = ref[5] + g * speed * left + stiff * 2 * jnp.sin(0.5 * turn)
         v = speed * jnp.maximum(jnp.cos(off), 0.0) + k.place * ahead
         v += _rotated(integral, -pose[2])[0]
         return jnp.stack([v, jnp.zeros(()), yaw_rate])

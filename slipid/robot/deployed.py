@@ -323,7 +323,8 @@ def _inverse_kinematics(
     Wheels roll without slip where a record has no such matrix. A robot that cannot drive sideways
     ignores the sideways velocity.
     """
-    rolling = np.asarray(geometry.forward()) / float(geometry.wheel_radius)
+    with np.errstate(over="ignore"):
+        rolling = np.asarray(geometry.forward()) / float(geometry.wheel_radius)
     axes = [0, 1, 2] if geometry.determines_twist else [0, 2]
     out = np.tile(rolling, (len(record.floors), 1, 1))
     for k, floor in enumerate(record.floors):

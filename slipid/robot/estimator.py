@@ -21,10 +21,17 @@ from slipid.parameter import as_numbers
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter, FloorState, TimeStep, length
+from slipid.robot.filter.gyro import GyroState, check_gyro, set_aside
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.filter.pose_filter import PoseFilter, axes_rotation
 from slipid.robot.filter.pose_fix import PoseState, apply_map
-from slipid.robot.filter.wheels import WheelState, read_currents, read_wheels, time_step
+from slipid.robot.filter.wheels import (
+    WheelState,
+    largest_current,
+    read_currents,
+    read_wheels,
+    time_step,
+)
 from slipid.robot.interface import (
     AbstractEstimator,
     Pose,
@@ -44,6 +51,8 @@ class EstimatorState(eqx.Module):
     Attributes:
         wheels: angles, speeds and ages of the wheels' readings.
         current: filtered currents of the motors [A].
+        refused: number of readings of ammeters and voltmeters that were set aside since the start.
+        gyro: readings of the gyro that contradict the model.
         floors: belief about the floors under the wheels.
         place: pose with its covariance.
         stuck: time since the body stopped moving while its wheels turn [s].
@@ -52,6 +61,8 @@ class EstimatorState(eqx.Module):
 
     wheels: WheelState
     current: Float[Array, " drive"]
+    refused: Float[Array, ""]
+    gyro: GyroState
     floors: FloorState
     place: PoseState
     stuck: Float[Array, ""]
@@ -92,6 +103,8 @@ class Estimator(AbstractEstimator[EstimatorState]):
         return EstimatorState(
             wheels=WheelState.init(f, s),
             current=jnp.zeros(f.drives),
+            refused=jnp.zeros(()),
+            gyro=GyroState.init(),
             floors=FloorFilter(f, s).init(),
             place=PoseFilter(f, s).init(pose, std),
             stuck=jnp.zeros(()),
@@ -107,32 +120,46 @@ class Estimator(AbstractEstimator[EstimatorState]):
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
         currents = read_currents(f, s, old.current, z, w, dt)
+        refused = old.refused + currents.rejected
         tick = TimeStep(
             dt=dt,
             moves=jnp.max(jnp.abs(f.frame.radius * w)) > s.still_m_s,
             acceleration=jnp.max(jnp.abs(w - old.wheels.speed)) / jnp.maximum(dt, 1e-3),
         )
-        gyro = jnp.where(jnp.isfinite(z.gyro) & (jnp.abs(z.gyro) < 50.0), z.gyro, jnp.nan)
-        turn = gyro - old.place.nuisance[-1]
         steering = old.steering
         if z.steering_angle is not None and steering is not None:
             read = jnp.isfinite(z.steering_angle) & (jnp.abs(z.steering_angle) < MOST)
             steering = jnp.where(read, z.steering_angle, steering)
-        by_floor, by_pose, before = FloorFilter(f, s, steering), PoseFilter(f, s), old.place
+        by_floor, by_pose = FloorFilter(f, s, steering), PoseFilter(f, s)
+        of = by_floor.predict(old.floors, w)
+        gap = by_pose.gyro_gap(old.place, z.gyro, *by_floor.yaw_rate(old.floors, of, tick), tick)
+        heard, checked = check_gyro(old.gyro, z.gyro, *gap, s.gyro_std, dt)
+        gyro, before = checked.rate, by_pose.turned(old.place, checked.turn, checked.doubt)
+        bias = before.nuisance[-1]
+        turn = gyro - bias
         if self.floor is None:
-            floors, motion = by_floor.step(old.floors, w, currents, turn, tick)
+            floors, motion = by_floor.step(old.floors, of, currents, turn, tick)
         else:
             hypotheses = hypotheses_of(f).under
             root, supports = by_pose.mapped(before, self.floor, hypotheses)
             mapped = jnp.mean(supports, axis=0)
-            floors, motion = by_floor.step(old.floors, w, currents, turn, tick, mapped)
+            floors, motion = by_floor.step(old.floors, of, currents, turn, tick, mapped)
             before, left = apply_map(before, root, supports, motion)
             supports = by_pose.mapped(before, self.floor, hypotheses)[1]
             floors = _corrected(floors, left, before, jnp.mean(supports, axis=0))
         place, twist, left = by_pose.step(before, motion, gyro, z, tick)
         floors = replace(floors, apart=floors.apart @ left.T)
         stuck = self._stuck(old.stuck, w, twist, tick)
-        new = EstimatorState(wheels, currents.filtered, floors, place, stuck, steering)
+        new = EstimatorState(
+            wheels=wheels,
+            current=currents.filtered,
+            refused=refused,
+            gyro=set_aside(heard, checked, twist[2], bias, left[2, 2], dt),
+            floors=floors,
+            place=place,
+            stuck=stuck,
+            steering=steering,
+        )
         unknown = floors.belief[-1]
         none = jnp.full((f.wheels, 1), unknown)
         return new, StateEstimate(
@@ -146,6 +173,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=stuck > 0.4,
             out_of_range=self._beyond(w, currents.filtered, unknown),
+            rejected=jnp.stack([heard.rejected, wheels.rejected, refused, place.fixes.rejected]),
             labels=f.labels,
         )
 
@@ -194,11 +222,13 @@ class OdometryState(eqx.Module):
         pose: x, y [m], heading [rad].
         wheels: angles, speeds and ages of the wheels' readings.
         current: smoothed magnitude of the motors' currents [A].
+        refused: number of readings of ammeters that were set aside since the start.
     """
 
     pose: Float[Array, "3"]
     wheels: WheelState
     current: Float[Array, " drive"]
+    refused: Float[Array, ""]
 
 
 class Odometry(AbstractEstimator[OdometryState]):
@@ -230,6 +260,7 @@ class Odometry(AbstractEstimator[OdometryState]):
             pose=pose,
             wheels=WheelState.init(self.robot, self.settings),
             current=jnp.zeros(self.robot.drives),
+            refused=jnp.zeros(()),
         )
 
     def advance(
@@ -240,7 +271,8 @@ class Odometry(AbstractEstimator[OdometryState]):
         dt = time_step(dt, s)
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
-        known = jnp.isfinite(z.current) & (jnp.abs(z.current) < 10.0 * f.highest[1])
+        known = jnp.isfinite(z.current) & (jnp.abs(z.current) < largest_current(f, s))
+        refused = old.refused + jnp.sum(jnp.isfinite(z.current) & ~known)
         # use the current filter of the 2021 paper's robot, whose factor of 0.97 per row of its logs
         # is a time constant of 0.6 s
         a = 1 - jnp.exp(-dt / 0.6)
@@ -253,7 +285,9 @@ class Odometry(AbstractEstimator[OdometryState]):
         twist = f.inverse @ (f.frame.radius * w * (1 - slip))
         pose = compose(old.pose, advance(twist, dt))
         unknown = jnp.zeros((f.wheels, len(f.labels) + 1)).at[:, -1].set(1.0)
-        return OdometryState(pose=pose, wheels=wheels, current=amps), StateEstimate(
+        none = jnp.zeros(())
+        new = OdometryState(pose=pose, wheels=wheels, current=amps, refused=refused)
+        return new, StateEstimate(
             pose=pose,
             twist=twist,
             slip=slip,
@@ -264,5 +298,6 @@ class Odometry(AbstractEstimator[OdometryState]):
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=jnp.zeros((), bool),
             out_of_range=jnp.max(jnp.abs(w)) > 1.3 * f.highest[0],
+            rejected=jnp.stack([none, wheels.rejected, refused, none]),
             labels=f.labels,
         )

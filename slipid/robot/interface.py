@@ -28,6 +28,12 @@ floors [1]; it is below the default, since several floors under such a robot are
 UNTIMED_S = 0.01
 """Duration that is assumed for a step whose `dt` is invalid, so that readings still age and a stop
 still makes progress [s]."""
+ACCELERATION_MARGIN = 4.0
+"""Ratio of the largest plausible acceleration of a wheel to that of a robot's commands [1]."""
+LEAST_ACCELERATION = 1.0
+"""Smallest acceleration of a rim that is taken for that of a robot's commands here [m/s^2]."""
+PERIOD = 0.05
+"""Time between two commands [s]."""
 State = TypeVar("State", bound=eqx.Module)
 Some = TypeVar("Some", bound=eqx.Module)
 Scalar = Float[Array, ""] | float
@@ -57,6 +63,9 @@ class Settings(eqx.Module):
         gyro_std: std of a gyro's noise [rad/s].
         gyro_bias_std: std of a gyro's bias at the start [rad/s].
         gyro_delay_s: age of a gyro's readings when they arrive [s].
+        wheel_acceleration: acceleration of a wheel up to which a single reading of its encoder is
+            believed [rad/s^2].
+        supply_voltage: voltage of the supply, which limits the plausible currents [V].
         still_m_s: rim speed below which the robot counts as at rest [m/s].
         stale_s: time without readings after which a wheel counts as stale [s].
         longest_s: longest time step; a longer `dt` is limited to it [s].
@@ -74,6 +83,8 @@ class Settings(eqx.Module):
     gyro_std: Scalar = 0.004
     gyro_bias_std: Scalar = 0.01
     gyro_delay_s: Scalar = 0.0
+    wheel_acceleration: Scalar = 100.0
+    supply_voltage: Scalar = 60.0
     still_m_s: Scalar = 0.003
     stale_s: Scalar = 0.3
     longest_s: Scalar = 0.5
@@ -86,11 +97,16 @@ class Settings(eqx.Module):
             ValueError: the robot consists of arrays without a record.
         """
         record = with_record(robot).record
+        acceleration, voltage = record.limits.acceleration.value, record.limits.voltage
+        radius = robot.frame.radius
+        supply = cls.supply_voltage if voltage.provenance == "assumed" else voltage.value
         parts = vars(record.sensors).items()
         known = {name: part.value for name, part in parts if isinstance(part, Setting)}
         return cls(
             current_is_signed=record.sensors.current_is_signed,
             further_floor_penalty=record.alike,
+            wheel_acceleration=ACCELERATION_MARGIN * max(acceleration, LEAST_ACCELERATION) / radius,
+            supply_voltage=supply,
             **known,
         )
 
@@ -189,6 +205,8 @@ class StateEstimate(eqx.Module):
         immobilised: True if the wheels turn while the body stands still.
         out_of_range: True if speed or currents far exceed those of the fitted runs, or the floor is
             unknown.
+        rejected: number of readings since the start that were set aside as implausible, of the
+            gyro, of all encoders, of all ammeters and voltmeters, and of the pose fixes.
         labels: names of the floors.
     """
 
@@ -202,6 +220,7 @@ class StateEstimate(eqx.Module):
     stale: Bool[Array, ""]
     immobilised: Bool[Array, ""]
     out_of_range: Bool[Array, ""]
+    rejected: Float[Array, "4"]
     labels: tuple[str, ...] = eqx.field(static=True)
 
     @property

@@ -19,6 +19,8 @@ Numbers = float | tuple[float, ...]
 Pair = tuple[float, float]
 Axes = tuple[float, float, float]
 """Values along, across and in yaw."""
+Rows = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+"""Rows (ahead, to the left, yaw) of a matrix from the drives' wheel speeds to the body twist."""
 Source = Literal["laplace", "posterior", "given"]
 Verdict = Literal["identified", "weak", "disputed", "not_identified", "at_bound", "fixed"]
 Provenance = Literal["measured", "borrowed", "override"]
@@ -33,6 +35,7 @@ UNITS = {
     "floors.process": "m/sqrt(m), m/sqrt(m), rad/sqrt(m)",
     "floors.effect": "m/m, m/m, rad/m",
     "floors.kinematics": "m/rad, m/rad, rad/rad",
+    "floors.calibration": "m/rad, m/rad, rad/rad",
     "floors.wheelbase": "m",
     "floors.current_std": "A",
     "floors.seen.wheel_speed": "rad/s",
@@ -52,6 +55,7 @@ UNITS = {
     "loads.inverse_kinematics": "rad/m, rad/m, 1",
     "current_trend": "A, A*s/m",
     "highest_speed": "rad/s",
+    "nominal": "m/rad, m/rad, rad/rad",
     "steering.zero": "rad",
     "steering.gain": "1",
     "steering.understeer": "s^2/m",
@@ -103,6 +107,12 @@ def plain(value: np.ndarray) -> Numbers:
     return float(value.reshape(())) if value.size == 1 else tuple(float(v) for v in value)
 
 
+def rows_of(matrix: np.ndarray) -> Rows:
+    """Convert a matrix with three rows to tuples of floats."""
+    ahead, left, yaw = (tuple(float(x) for x in row) for row in matrix)
+    return ahead, left, yaw
+
+
 def axes_of(row: Iterable[float] | np.ndarray) -> Axes:
     """Convert three numbers (along, across, yaw) to a tuple of floats."""
     along, across, yaw = (float(x) for x in row)
@@ -146,6 +156,8 @@ class FloorRecord:
         kinematics: rows of the matrix from the drives' wheel speeds to the body twist, where
             calibrated kinematics were selected for all wheels on this floor; None where the force
             balance is used.
+        calibration: rows of the same matrix by the calibration of the wheels, whether it was
+            selected or not; None without a calibration.
         wheelbase: effective wheelbase of a robot that steers; None for others.
     """
 
@@ -155,7 +167,8 @@ class FloorRecord:
     current_std: float
     seen: Validity | None
     unseen: bool = False
-    kinematics: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] | None = None
+    kinematics: Rows | None = None
+    calibration: Rows | None = None
     wheelbase: float | None = None
 
 
@@ -361,6 +374,8 @@ class RobotRecord:
         current_trend: a and b of the excess a + b v of measured over modelled currents at a body
             speed v.
         highest_speed: highest wheel speed of the fitted runs.
+        nominal: rows of the matrix from the drives' wheel speeds to the body twist with the lengths
+            of the config and without slip; None if they are those of the parameters.
         limits: limits of commands.
         sensors: sensors of the logs.
         actuators: response of the wheels to commands.
@@ -382,6 +397,7 @@ class RobotRecord:
     current_trend: Pair
     highest_speed: float
     limits: LimitsRecord
+    nominal: Rows | None = None
     sensors: LogSensors = LogSensors()
     actuators: ActuatorRecord = ActuatorRecord()
     alike: float = 3.0

@@ -167,7 +167,7 @@ def _with_assumed(content: Mapping[str, Any]) -> dict[str, object]:
     """Return the content of a file of schema `BEFORE` as `SCHEMA` has it, with a message.
 
     Limits, noise of sensors and actuators were not written; the values are those that every robot
-    had.
+    had. Nominal and calibrated kinematics were not written either.
     """
     limits = LimitsRecord(Setting(0.5), Setting(2.0), Setting(1.0), Setting(13.0), Setting(22.0))
     message = (
@@ -175,11 +175,15 @@ def _with_assumed(content: Mapping[str, Any]) -> dict[str, object]:
         "2 rad/s, acceleration 1 m/s^2, wheel speed 13 rad/s, voltage 22 V and the noise of its "
         "sensors are assumed; write the file again with `slipid identify`"
     )
-    found = {**content, "limits": asdict(limits), "actuators": asdict(ActuatorRecord())}
+    found: dict[str, object] = {"nominal": None, **content}
+    found |= {"limits": asdict(limits), "actuators": asdict(ActuatorRecord())}
     if isinstance(messages := content.get("messages"), list):
         found["messages"] = [*messages, message]
     if isinstance(sensors := content.get("sensors"), dict):
         found["sensors"] = asdict(LogSensors()) | sensors
+    if isinstance(floors := content.get("floors"), list):
+        empty = {"calibration": None}
+        found["floors"] = [empty | floor if isinstance(floor, dict) else floor for floor in floors]
     if isinstance(loads := content.get("loads"), list):
         none = {"inverse_kinematics": None}
         found["loads"] = [none | load if isinstance(load, dict) else load for load in loads]
@@ -254,8 +258,11 @@ def check_record(record: RobotRecord) -> None:
                 f"{kind} {list(names)}; expected at least one name, and each name only once"
             )
     for floor in record.floors:
-        for row in floor.kinematics or ():
-            _counted(f"floors, {floor.name}: kinematics", row, drives)
+        for name in ("kinematics", "calibration"):
+            for row in getattr(floor, name) or ():
+                _counted(f"floors, {floor.name}: {name}", row, drives)
+    for row in record.nominal or ():
+        _counted("nominal", row, drives)
     _steered(record)
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))

@@ -67,6 +67,8 @@ class ControllerState(eqx.Module):
         gave_up: True if the robot was stuck and has stopped until it is armed again, by `rearmed`
             or by a demand of no motion for `REARM_S`.
         limited: True if a limit was active in the last command.
+        pursues: True while the demanded twist follows a reference, from `Controller.asked` to
+            `Controller.drive`.
         begun: True if a command has been computed already.
     """
 
@@ -83,13 +85,14 @@ class ControllerState(eqx.Module):
     drives_off: Bool[Array, ""]
     gave_up: Bool[Array, ""]
     limited: Bool[Array, ""]
+    pursues: Bool[Array, ""]
     begun: Bool[Array, ""]
 
     @classmethod
     def init(cls, drives: int) -> "ControllerState":
         """Return the state of a robot at rest before its first command."""
         each, twist = jnp.zeros(drives), jnp.zeros(3)
-        zero, no = (jnp.zeros(()),) * 2, (jnp.zeros((), bool),) * 4
+        zero, no = (jnp.zeros(()),) * 2, (jnp.zeros((), bool),) * 5
         return cls(each, jnp.zeros(2), twist, twist, *zero, each, each, *zero, *no)
 
     def rearmed(self) -> "ControllerState":

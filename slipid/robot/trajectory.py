@@ -67,6 +67,7 @@ class Path(eqx.Module):
         dt: Float[Array, ""] | float,
         preview: Float[Array, ""] | float = 0.0,
         arm: Float[Array, ""] | float = 0.0,
+        sideways: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
         """Return the time of the path one step later, and the reference at the new time.
 
@@ -75,20 +76,21 @@ class Path(eqx.Module):
         The path slows down, and its rates with it, while the robot's estimated `pose` lags behind
         the reference or is off to the side. A heading that lags counts as the distance that a point
         at the end of a lever `arm` [m] lags; with 0 headings do not count. The path does not wait
-        for a robot that is ahead. A `dt` [s] that is not a positive number counts as 0; time
-        advances by at most `LONGEST_STEP`.
+        for a robot that is ahead, nor for the first `sideways` [m] of a distance to the side. A
+        `dt` [s] that is not a positive number counts as 0; time advances by at most `LONGEST_STEP`.
         """
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST_STEP), 0.0)
         here = self.at(time)
         gap, v = here[:2] - pose[:2], here[3:5]
         size = jnp.sqrt(v @ v + 1e-12)
-        ahead = jnp.minimum(gap @ v / size, 0.0)
-        beside = jnp.maximum(gap @ gap - jnp.where(size > 1e-3, ahead, 0.0) ** 2, 0.0)
+        along = jnp.where(size > 1e-3, gap @ v / size, 0.0)
+        beside = jnp.sqrt(jnp.maximum(gap @ gap - along**2, 0.0) + 1e-12)
+        lag = jnp.maximum(along, 0.0) ** 2 + jnp.maximum(beside - sideways, 0.0) ** 2
         turn = here[2] - pose[2]
         turn = turn - 2 * jnp.pi * jnp.floor(turn / (2 * jnp.pi) + 0.5)
         turn = jnp.where(turn * here[5] < -1e-3 * jnp.abs(turn), 0.0, turn)
-        off = jnp.sqrt(beside + (arm * turn) ** 2 + 1e-12)
+        off = jnp.sqrt(lag + (arm * turn) ** 2 + 1e-12)
         rate = jnp.clip((WAIT_M - off) / (WAIT_M - FULL_SPEED_M), 0.0, 1.0)
         time = jnp.asarray(time) + rate * dt
         rates = self.at(time + preview)[3:] * rate

@@ -1,16 +1,17 @@
 """The twin: the identified model of a robot as a plant for closed-loop runs.
 
-Commands reach the wheels with a delay, a limited acceleration and a lag. The body moves by the
-contact model with the floor under each wheel. The errors of the model are drawn at random for every
-run, with effects as in `slipid.robot.filter.effects`:
+Commands reach the drives with a delay, a limited acceleration and a lag. The body moves by the
+contact model with the floor under each wheel, or by the calibrated kinematics of a floor for which
+they were selected, while all wheels are on it. The errors of the model are drawn at random for
+every run, with effects as in `slipid.robot.filter.effects`:
 
     set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
-    xi = equilibrium(r w; floor under each wheel)
+    xi = equilibrium(r w; floor under each wheel)  or  kinematics w
     pose <- pose * exp(xi h + s h (estimated + remaining effect) + sqrt(s h) process)
 
-with h the substep [s], `set` the set-point speeds of the wheels' speed control and w the wheel
-speeds [rad/s], r the wheel radius [m], xi the body twist [m/s, m/s, rad/s] and s the speed of the
-body if no wheel slipped [m/s].
+with h the substep [s], `set` the set-point speeds of the drives' speed control and w the wheel
+speeds of the drives [rad/s], r the wheel radius [m], xi the body twist [m/s, m/s, rad/s] and s the
+speed of the body if no wheel slipped [m/s].
 
 Everything is differentiable except for the choice of the floor under a wheel; derivatives ignore
 the quantization of encoders. Use forward mode (`jax.jvp`, `jax.jacfwd`), since NaN readings would
@@ -28,15 +29,15 @@ from jaxtyping import Array, Float
 from slipid.model.motor import sign_of_motion
 from slipid.model.se2 import advance, compose
 from slipid.parameter import as_numbers
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.effects import RolledMotion, effect_correlation, travel_direction
 from slipid.robot.filter.floor import Floor
-from slipid.robot.interface import Measurement, Pose, Readings
+from slipid.robot.interface import PERIOD, Measurement, Pose, Readings
 
 KEPT_COMMANDS = 6
-"""Number of commands that are kept, including the newest; the delay is at most `KEPT_COMMANDS` - 1
-periods."""
+"""Number of commands that are kept, including the newest."""
+LONGEST_DELAY_S = (KEPT_COMMANDS - 1) * PERIOD
+"""Longest delay of a twin [s]."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +108,9 @@ class TwinState(eqx.Module):
     Attributes:
         pose: x, y [m], heading [rad].
         twist: velocity of the body in its own axes [m/s, m/s, rad/s].
-        wanted: set-point speeds of the wheels' speed control [rad/s].
-        speed: wheel speeds [rad/s].
-        angle: wheel angles [rad].
+        wanted: set-point speeds of the drives' speed control [rad/s].
+        speed: speed of the wheels of each drive [rad/s].
+        angle: angle of the wheels of each drive [rad].
         effect: present effect of every floor less its estimate, in units of the remaining std.
         toward: settled direction of travel, see `slipid.robot.filter.effects`.
         offset: error of the modelled currents that is constant in a run [A].
@@ -120,15 +121,15 @@ class TwinState(eqx.Module):
 
     pose: Float[Array, "3"]
     twist: Float[Array, "3"]
-    wanted: Float[Array, " wheel"]
-    speed: Float[Array, " wheel"]
-    angle: Float[Array, " wheel"]
+    wanted: Float[Array, " drive"]
+    speed: Float[Array, " drive"]
+    angle: Float[Array, " drive"]
     effect: Float[Array, "floor 3"]
     toward: Float[Array, "3"]
-    offset: Float[Array, " wheel"]
-    drift: Float[Array, " wheel"]
+    offset: Float[Array, " drive"]
+    drift: Float[Array, " drive"]
     bias: Float[Array, ""]
-    ring: Float[Array, "command wheel"]
+    ring: Float[Array, "command drive"]
 
 
 class Twin(eqx.Module):
@@ -145,21 +146,21 @@ class Twin(eqx.Module):
     actuators: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
-        """Raise `ValueError` for a delay below 0 or longer than the time of the kept commands."""
-        most = (KEPT_COMMANDS - 1) * PERIOD
-        if not 0 <= self.actuators.delay_s <= most:
+        """Raise `ValueError` for a delay below 0 or above `LONGEST_DELAY_S`."""
+        if not 0 <= self.actuators.delay_s <= LONGEST_DELAY_S:
             raise ValueError(
-                f"delay_s = {self.actuators.delay_s}; expected a delay from 0 to {most:g} s"
+                f"delay_s = {self.actuators.delay_s}; expected a delay from 0 to "
+                f"{LONGEST_DELAY_S:g} s"
             )
 
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
         """Return the standard normal random numbers of a step; `number` is 0 for `first`."""
-        count = 3 * (self.robot.wheels + self.actuators.substeps + len(self.robot.labels)) + 1
+        count = 3 * (self.robot.drives + self.actuators.substeps + len(self.robot.labels)) + 1
         return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
     def init(self, pose: Pose, key: Array) -> TwinState:
         """Return the state at rest at a pose [m, m, rad]; `key` draws the errors of this run."""
-        f, w = self.robot, (self.robot.wheels,)
+        f, w = self.robot, (self.robot.drives,)
         one, two, three = jax.random.split(jax.random.fold_in(key, 2**31 - 1), 3)
         off = jax.random.normal(two, w) * jnp.mean(f.current_std) / jnp.sqrt(2.0)
         zero = jnp.zeros(w)
@@ -178,7 +179,7 @@ class Twin(eqx.Module):
         )
 
     def step(
-        self, state: TwinState, command: Float[Array, " wheel"], noise: Float[Array, " noise"]
+        self, state: TwinState, command: Float[Array, " drive"], noise: Float[Array, " noise"]
     ) -> tuple[TwinState, Readings]:
         """Return state and readings one control period after a command [rad/s] is given."""
         old, b, h = state, self.actuators, self.actuators.substep
@@ -207,19 +208,28 @@ class Twin(eqx.Module):
     def _roll(
         self, pose: Array, w: Array, effect: Array, push: Array, h: float
     ) -> tuple[Array, Array]:
-        """Return the pose one substep later, and the twist by contact equilibrium.
+        """Return the pose one substep later, and the twist by the model of the floors.
 
         The pose also moves by the effects and by the random errors of the floors under the wheels.
         """
         f = self.robot
         under = self.floor.under(pose, f.places)
-        xi = f.standing(under).twist(w)
+        xi = self._twist(under, w)
         rolled = RolledMotion.of(f.inverse @ (f.frame.radius * w), f.frame.base)
         mean, part = f.effect_table.at(rolled)
         errors, far, share = mean + part * f.effect * effect, rolled.speed * h, f.rest[:, None]
         off = far * jnp.sum(share * errors[under], axis=0)
         off += jnp.sqrt(far + 1e-12) * push * jnp.sqrt(jnp.sum(share * f.process[under] ** 2, 0))
         return compose(pose, advance(xi + rolled.axes @ off / h, h)), xi
+
+    def _twist(self, under: Array, w: Array) -> Array:
+        """Return the body twist at wheel speeds `w` on the floors `under` the wheels."""
+        f = self.robot
+        xi = f.standing(under).twist(f.at_wheels(w))
+        if not any(f.calibrated):
+            return xi
+        uses = jnp.all(under == under[0]) & jnp.asarray(f.calibrated)[under[0]]
+        return jnp.where(uses, f.kinematics[under[0]] @ w, xi)
 
     def _effects(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
         """Return the floors' effects and the settled direction for the next control period."""
@@ -234,10 +244,11 @@ class Twin(eqx.Module):
 
     def _currents(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
         """Return signed currents [A], and the new value of their correlated errors [A]."""
-        f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
+        f, drives, xi, w = self.robot, self.robot.drives, now.twist, now.speed
         under = self.floor.under(now.pose, f.places)
         keep = float(np.exp(-PERIOD / self.actuators.drift_s))
-        fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
+        std = f.on_average(f.current_std[under])
+        fresh = jnp.sqrt((1 - keep**2) / 2.0) * std * noise[:drives]
         drift = keep * now.drift + fresh
         # a motor at standstill draws no current, so the errors fade out there as well
         moves = sign_of_motion(w) ** 2
@@ -248,9 +259,9 @@ class Twin(eqx.Module):
 
     def _read(self, angle: Array, w: Array, amps: Array, turn: Array, noise: Array) -> Readings:
         """Return noisy readings, with NaN for all quantities that the robot does not measure."""
-        b, wheels = self.actuators, self.robot.wheels
+        b, drives = self.actuators, self.robot.drives
         _, by_amps, by_volts, by_turn = jnp.split(
-            noise[3 * b.substeps :], [wheels, 2 * wheels, 3 * wheels]
+            noise[3 * b.substeps :], [drives, 2 * drives, 3 * drives]
         )
         tick = 2 * np.pi / b.ticks
         whole = jax.lax.stop_gradient(jnp.floor(angle / tick) * tick - angle)
@@ -261,7 +272,7 @@ class Twin(eqx.Module):
             current=read if b.signed else jnp.abs(read),
             voltage=volts if b.voltage else None,
             gyro=turn + b.gyro_noise * by_turn[0] if b.gyro else None,
-        ).filled(wheels)
+        ).filled(drives)
 
 
 class TwinPlant:
@@ -276,7 +287,7 @@ class TwinPlant:
         self._state, reading = _first_step(self.twin, self.start, self.key)
         return reading
 
-    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
+    def step(self, wheel_speed: Float[np.ndarray, " drive"]) -> Readings:
         self._count += 1
         command, count = jnp.asarray(wheel_speed), jnp.asarray(self._count)
         self._state, reading = _stepped(self.twin, self._state, command, self.key, count)

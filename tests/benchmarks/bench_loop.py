@@ -132,9 +132,9 @@ def driven(robot, row, path, steps=STEPS):
     from slipid.deploy.twin_run import starts, twin_floor
     from slipid.lab.trial.controllers import ROWS as TRIAL
     from slipid.lab.trial.trial import drawn_robot
-    from slipid.robot.closed_loop import PERIOD, ClosedLoopRun, ControlLoop, path_metrics
+    from slipid.robot.closed_loop import ClosedLoopRun, ControlLoop, path_metrics
     from slipid.robot.filter.floor import Floor
-    from slipid.robot.interface import Settings
+    from slipid.robot.interface import PERIOD, Settings
     from tests.helpers.rolled_out import rollout
     from tests.helpers.telling_twin import TellingTwin
 
@@ -195,6 +195,7 @@ def driven(robot, row, path, steps=STEPS):
             command=np.asarray(said.command[k, :end]),
             estimate=said.estimate,
             energy=np.full(end, np.nan),
+            recovering=np.zeros(end, bool),
         )
         m = path_metrics(course)
         helpless = bool(said.gave_up[k, end - 1])

@@ -45,9 +45,8 @@ def ends(robot, recovery):
     from slipid.lab.trial.controllers import ROWS
     from slipid.lab.trial.trial import drawn_robot
     from slipid.robot import trajectory
-    from slipid.robot.closed_loop import PERIOD
     from slipid.robot.filter.floor import Floor
-    from slipid.robot.interface import Settings
+    from slipid.robot.interface import PERIOD, Settings
     from tests.helpers.rolled_out import rollout
     from tests.helpers.telling_twin import TellingTwin
 

@@ -31,8 +31,9 @@ from slipid.exports.c99.code import Code
 from slipid.lab.trial.controllers import ROWS
 from slipid.model.geometry import omni
 from slipid.robot import trajectory
-from slipid.robot.closed_loop import PERIOD, ControlLoop
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.interface import PERIOD
 from slipid.robot.twin import Twin
 from tests.benchmarks.quick import quick
 from tests.helpers.compiled_c import CompiledC

@@ -66,7 +66,7 @@ def test_a_fit_writes_its_robot(fitted):
         group, _, name = path.partition(".")
         assert getattr(getattr(record, group), name) == Setting(value, origin)
     assert {"limits.speed", "limits.voltage"} <= fit.robot_settings.keys()
-    assert Limits.of(robot).speed == fit.robot_settings["limits.speed"][0] != Limits().speed
+    assert Limits.of(robot).speed == fit.robot_settings["limits.speed"][0]
     again = deploy(fit)
     assert again.record == record
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(robot), strict=True):
@@ -110,8 +110,8 @@ def test_gains_of_an_older_file_outlive_the_same_numbers_and_are_driven_with(fit
     write_robot(out, fit)
     assert read_robot(out).record == tuned
     del found["ahead"]
-    by_hand = {name: float(gain) for name, gain in vars(Gains()).items()}
-    for words, gains in (((), by_hand), (("--tuned-gains",), found)):
+    own = {name: float(gain) for name, gain in vars(Gains.of(read_robot(out))).items()}
+    for words, gains in (((), own), (("--tuned-gains",), found)):
         done = invoke("trial", out, *TRIAL, *words)
         assert done.exit_code == 0, done.output
         assert json.loads((out / "trial.json").read_text())["gains"] == gains

@@ -18,12 +18,12 @@ from slipid.deploy.export import FORMS, ExportOptions, export
 from slipid.deploy.twin_run import REST_S, starts, twin_floor
 from slipid.exports.c99.folder import c_files
 from slipid.exports.folder import check_folder
+from slipid.lab.testsite.site import Site
 from slipid.lab.trial.controllers import ROWS
 from slipid.lab.trial.trial import SitePlant
 from slipid.robot import closed_loop
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.interface import Measurement
+from slipid.robot.interface import PERIOD, Measurement
 from slipid.robot.trajectory import rectangle
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -126,7 +126,7 @@ def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     command = ["cc", "-O2", "-DDIGITS=15", "-Isrc", "-o", "drive", *sources]
     subprocess.run(command, cwd=tmp_path, check=True)
     floor = twin_floor(ROBOT)
-    plant = SitePlant(floor, "as_built", starts(20, floor, rectangle())[3], 5, False)
+    plant = SitePlant(Site(), floor, "as_built", starts(20, floor, rectangle())[3], 5)
     wanted = closed_loop.run_closed_loop(control_loop, path, plant, (0.0, 0.0, 0.0))
     program, reading, rows = Program(tmp_path / "drive"), plant.reset(), []
     for _ in wanted.time:
@@ -188,3 +188,12 @@ def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, 
     monkeypatch.setattr(made, lambda *_, **__: pytest.fail("made"))
     with pytest.raises(DataError, match="files that an export did not write"):
         export(ROBOT, tmp_path, ExportOptions(), QUIET)
+
+
+@pytest.mark.slow
+def test_recovery_is_an_option_of_an_export(folder, tmp_path):
+    """It is off by default for a robot without a gyro."""
+    assert "recovery is off in this export" in (folder / "c/README.md").read_text()
+    options = ExportOptions(("c",), "slip_odometry", recovery=True)
+    export(ROBOT, tmp_path / "on", options, QUIET)
+    assert "recovery is off" not in (tmp_path / "on/c/README.md").read_text()

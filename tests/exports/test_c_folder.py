@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from slipid.exports.c99.folder import c_files
+from slipid.exports.ros.package import package_files
 from slipid.robot.trajectory import rectangle
 from tests.helpers.compiled_c import NEEDS_COMPILER, code
 
@@ -129,3 +132,41 @@ def test_the_sketch_for_arduino_compiles_and_runs(folder, tmp_path):
     subprocess.run([*words, "-o", tmp_path / "sketch", "-lm"], check=True)
     result = subprocess.run([tmp_path / "sketch"], capture_output=True, text=True, check=True)
     assert result.stdout == "0 0"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+@pytest.mark.parametrize("floats", [[], ["-DSLIPID_FLOAT"]])
+def test_the_node_for_ros2_compiles_and_drives_a_robot(folder, tmp_path, floats):
+    """With stubs of ROS 2 whose wheels follow: 2 s of a velocity ahead, then no message more."""
+    robot = code("contact").robot
+    for name, text in package_files(robot, (0.1, 0.2, 1e6, 1e6, 1e6, 0.3)).items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    node, stubs = tmp_path / "node/src/slipid_node.cpp", Path(__file__).parents[1] / "helpers"
+    for header in re.findall(r"#include <(\w+/.*)>", node.read_text()):
+        (tmp_path / "stubs" / header).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "stubs" / header).write_text('#include "ros_stubs.hpp"\n')
+        if not header.startswith("rclcpp"):
+            assert (
+                f"<depend>{header.split('/')[0]}</depend>"
+                in (tmp_path / "node/package.xml").read_text()
+            )
+    source, made, flags = folder / "src/slipid.c", tmp_path / "slipid.o", [*floats, "-O1"]
+    subprocess.run(["cc", "-std=c99", *flags, "-c", "-o", made, source], check=True)
+    places = ["-I", folder / "src", "-I", tmp_path / "stubs", "-I", stubs]
+    words = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", *flags, *places, node, made]
+    subprocess.run([*words, "-o", tmp_path / "node/slipid_node", "-lm"], check=True)
+    run = subprocess.run(
+        [tmp_path / "node/slipid_node"], capture_output=True, text=True, check=True
+    )
+    driving, resting, last = run.stdout.splitlines()
+    *speeds, ahead = map(float, driving.split())
+    wanted = np.asarray(robot.inverse_kinematics)[:, :, 0] * 0.1
+    np.testing.assert_allclose(speeds, wanted.mean(axis=0), atol=0.15 * np.abs(wanted).max())
+    assert 0.1 < ahead < 0.21
+    *speeds, further = map(float, resting.split())
+    np.testing.assert_allclose(speeds, 0.0, atol=1e-3)
+    assert ahead + 0.03 < further < ahead + 0.1
+    assert last.startswith("1 0 drives_off=false gave_up=false stale=false")
+    assert re.search(r" rejected_gyro=0 rejected_encoder=\d+ .* rejected_pose_fix=0$", last)

@@ -11,8 +11,7 @@ import pytest
 
 from slipid.exports.c99.code import Code
 from slipid.exports.fields import attribute_docs
-from slipid.robot.closed_loop import PERIOD
-from slipid.robot.interface import Measurement
+from slipid.robot.interface import PERIOD, Measurement
 from slipid.robot.trajectory import rectangle
 from tests.helpers.c_against_jax import Batch, Source, differences, wander
 from tests.helpers.compiled_c import NEEDS_COMPILER, QUICK, CompiledC, code, put, worst
@@ -114,8 +113,10 @@ def test_every_field_has_a_unit():
     plain = {f.name for s in code("contact").structs for f in s.fields if f.about.endswith("[1]")}
     assert plain == {
         *("floors_belief", "floors_expected", "place_toward", "begun", "slip"),
-        *("drives_off", "gave_up", "limited"),
-        *("surface_probability", "stale", "immobilised", "out_of_range"),
+        *("drives_off", "gave_up", "limited", "pursues"),
+        *("surface_probability", "stale", "immobilised", "out_of_range", "rejected"),
+        *("wheels_rejected", "refused", "gyro_rejected"),
+        *("place_fixes_agreeing", "place_fixes_rejected"),
     }
 
 

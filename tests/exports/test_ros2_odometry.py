@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from slipid.exports.ros.drive import rolling
 from slipid.exports.ros.folder import ros2_files
 from slipid.exports.ros.localization import (
     DISTANCE_M,
@@ -18,11 +20,14 @@ from slipid.exports.ros.localization import (
 )
 from slipid.exports.text import identifiers
 from slipid.model import contact
-from slipid.model.geometry import general, mecanum, omni
+from slipid.model.geometry import differential, general, mecanum, omni, skid_steer
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.limits import Limits
 from tests.helpers.exported import doubtful, known, mecanum_robot
 from tests.helpers.ros_yaml import parameters, read
 
 OMNI, MECANUM = "omni_wheel_drive_controller", "mecanum_drive_controller"
+DIFF = "diff_drive_controller"
 EKF = "ekf_filter_node"
 
 
@@ -47,8 +52,21 @@ def mecanum_speeds(p: Mapping[str, object], twist: np.ndarray) -> np.ndarray:
     return np.array(rims) / k["wheels_radius"]
 
 
+def diff_speeds(p: Mapping[str, object], twist: np.ndarray) -> np.ndarray:
+    """Joint speeds of diff_drive_controller: those on the left, then those on the right."""
+    apart = p["wheel_separation_multiplier"] * p["wheel_separation"]
+    speeds = []
+    for side, sign in (("left", -1), ("right", 1)):
+        radius = p[f"{side}_wheel_radius_multiplier"] * p["wheel_radius"]
+        speed = (twist[0] + sign * twist[2] * apart / 2) / radius
+        speeds += [speed] * len(p[f"{side}_wheel_names"])
+    return np.array(speeds)
+
+
 def joints(p: Mapping[str, object]) -> list[str]:
     corners = ("front_left", "front_right", "rear_right", "rear_left")
+    if "left_wheel_names" in p:
+        return [*p["left_wheel_names"], *p["right_wheel_names"]]
     return p.get("wheel_names") or [p[f"{c}_wheel_command_joint_name"] for c in corners]
 
 
@@ -102,6 +120,104 @@ def test_controllers_turn_wheels_as_the_robot_has_them(name):
     assert "The kinematics of this controller are the identified kinematics." in files["README.md"]
 
 
+def calibrated(robot: DeployedRobot, floor: int, *rows: tuple[float, ...]) -> DeployedRobot:
+    """The robot with calibrated kinematics on a floor."""
+    floors = list(robot.record.floors)
+    floors[floor] = replace(floors[floor], kinematics=rows)
+    return DeployedRobot.of(replace(robot.record, floors=tuple(floors)))
+
+
+AHEAD = {
+    "differential": differential(0.16, 0.08),
+    "skid steer, two motors": skid_steer(0.13, 0.19, 0.1, drive_of=(0, 1, 0, 1)),
+    "skid steer, one motor back": general(
+        [(-0.2, -0.3), (0.2, -0.3), (0.2, 0.3), (-0.2, 0.3)],
+        [0.0, 0.0, 180.0, 0.0],
+        [None] * 4,
+        0.1,
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", AHEAD)
+def test_wheels_that_point_ahead_turn_as_each_floor_wants_them(name):
+    robot = known(AHEAD[name])
+    if name == "differential":
+        left, right, apart = 0.081, 0.078, 0.33
+        rows = ((left / 2, right / 2), (0.001, -0.001), (-left / apart, right / apart))
+        robot = calibrated(robot, 0, *rows)
+    files = ros2_files(robot)
+    whole = parameters(files, "drive_controller.yaml", DIFF)
+    back = reversed_joints(files["README.md"])
+    worst = next(k for k, f in enumerate(robot.labels) if f"{f} (worst)" in files["README.md"])
+    assert sorted(joints(whole)) == [f"wheel_{k + 1}_joint" for k in range(robot.wheels)]
+    drives = robot.drive_of or range(robot.wheels)
+    for k, floor in enumerate(robot.labels):
+        own = parameters(files, f"floors/{floor}.yaml", DIFF)
+        changed = [n for n in own if "multiplier" in n and whole[n] != own[n]]
+        assert bool(changed) is (k != worst)
+        assert not any("limit" in n or "names" in n for n in own)
+        for twist in ((0.3, 0.0, 0.0), (0.0, 0.0, 0.7), (-0.2, 0.0, 0.4)):
+            wanted = np.asarray(robot.inverse_kinematics)[k] @ twist
+            for joint, speed in zip(joints(whole), diff_speeds(whole | own, twist), strict=True):
+                drive = drives[int(joint.split("_")[1]) - 1]
+                sign = -1 if joint in back else 1
+                limit = 0.02 * np.abs(wanted).max()
+                assert speed * sign == pytest.approx(wanted[drive], abs=limit), (floor, joint)
+        if robot.calibrated[k]:
+            assert own["left_wheel_radius_multiplier"] * 0.08 == pytest.approx(left, rel=1e-6)
+            assert own["right_wheel_radius_multiplier"] * 0.08 == pytest.approx(right, rel=1e-6)
+            assert own["wheel_separation_multiplier"] * 0.32 == pytest.approx(apart, rel=1e-6)
+    limits = Limits.of(robot)
+    assert whole["linear.x.max_velocity"] == -whole["linear.x.min_velocity"] == limits.speed
+    assert whole["angular.z.max_velocity"] == limits.yaw_rate
+    assert whole["linear.x.max_acceleration"] == limits.acceleration
+    rim = whole["angular.z.max_acceleration"] * whole["wheel_separation"] / 2
+    assert rim == pytest.approx(limits.acceleration)
+    assert f"type: {DIFF}/DiffDriveController" in files["README.md"]
+    assert parameters(files, "robot_localization.yaml", EKF)["odom0"] == f"/{DIFF}/odom"
+
+
+@pytest.mark.slow
+def test_a_robot_that_cannot_drive_sideways_does_not_go_there():
+    """Only by its heading: on a calibrated floor nothing slips, and vy is known to be almost 0."""
+    robot = known(AHEAD["differential"])
+    floors = [
+        replace(f, process=(0.01, 1e-4, 0.003), effect=(0.004, 1e-4, 0.02))
+        for f in robot.record.floors
+    ]
+    robot = DeployedRobot.of(replace(robot.record, floors=tuple(floors)))
+    one, apart = 0.04, 0.32
+    rows = ((one, one), (0.0, 0.0), (-2 * one / apart, 2 * one / apart))
+    robot = calibrated(robot, 0, *rows)
+    files, speed = ros2_files(robot), top_speed(robot)
+    p = parameters(files, "floors/firm.yaml", DIFF)
+    x, y, *_, yaw = np.sqrt(p["pose_covariance_diagonal"])
+    assert y == x == pytest.approx(np.hypot(0.004, 0.01), rel=0.15)
+    assert yaw == pytest.approx(np.hypot(0.02, 0.003), rel=1e-3)
+    vx, vy, *_, _ = np.sqrt(p["twist_covariance_diagonal"])
+    assert vy == pytest.approx(1e-4 * np.hypot(speed, np.sqrt(speed / PERIOD_S)))
+    assert vx > 20 * vy
+    # on the other floor the wheels slip, but neither sideways nor for all of a sideways demand
+    soft = parameters(files, "floors/soft.yaml", DIFF)
+    assert np.sqrt(soft["pose_covariance_diagonal"][1]) < 0.03
+    for name in ("robot_localization.yaml", "floors/firm.yaml", "floors/soft.yaml"):
+        noise = parameters(files, name, EKF)["process_noise_covariance"]
+        assert noise[7 * 16] < 1e-4 * noise[6 * 16]
+    fused = parameters(files, "robot_localization.yaml", EKF)["odom0_config"]
+    assert [k for k, used in enumerate(fused) if used] == [6, 7, 11]
+
+
+def test_a_floor_that_is_driven_with_other_multipliers_is_less_certain():
+    """The file without a floor has one floor's multipliers, and an error on the others."""
+    robot = known(AHEAD["differential"])
+    rolling = np.asarray(robot.inverse_kinematics)
+    errs, off = odometry_errors(robot, rolling), odometry_errors(robot, 1.1 * rolling)
+    assert off[0].slip[0] == pytest.approx(0.1 * np.sqrt(4 / 8), rel=0.1)
+    assert errs[0].slip[0] < 0.01
+
+
 @pytest.mark.slow
 def test_identified_sizes_stand_in_exactly(robot, files):
     p = parameters(files, "drive_controller.yaml", OMNI)
@@ -134,6 +250,7 @@ def test_deviating_drives_are_averaged_and_reported(robot, files):
             0.05,
         ),
         general([(0.2, 0.0), (-0.2, 0.1), (-0.2, -0.1)], [0.0, 0.0, 90.0], [90.0] * 3, 0.05),
+        general([(0.2, 0.1), (-0.2, 0.1), (0.0, -0.1)], [0.0] * 3, [None] * 3, 0.05),
     ],
 )
 def test_a_robot_that_no_controller_fits_gets_none(shape):
@@ -142,6 +259,11 @@ def test_a_robot_that_no_controller_fits_gets_none(shape):
     assert "No drive controller of ros2_controllers" in files["README.md"]
     assert list(read(files, "floors/soft.yaml")) == [EKF]
     assert parameters(files, "robot_localization.yaml", EKF)["odom0"] == "/odom"
+
+
+def without_multipliers(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
+    """Errors with a controller that has the same kinematics on every floor."""
+    return odometry_errors(robot, np.stack([rolling(robot)] * len(robot.labels)))
 
 
 # covariances ---------------------------------------------------------------------------------
@@ -155,6 +277,7 @@ def test_a_robot_that_no_controller_fits_gets_none(shape):
             "turns all the way", (0.01, 0.02, 0.01), (0.01, 0.03, 0.1), (0.01, 0.02, 0.1)
         ),
         OdometryErrors("turns anew", (0.01, 0.02, 0.2), (0.01, 0.02, 0.01), (0.0, 0.0, 0.0)),
+        OdometryErrors("no way", (0.02, 0.01, 0.1), (0.1, 0.01, 0.05), (0.0, 0.0, 0.1), False),
     ],
     ids=lambda errs: errs.floor,
 )
@@ -170,10 +293,9 @@ def test_variances_are_those_of_errors_that_are_drawn(errs):
     wide = max(along.var(), across.var())
     np.testing.assert_allclose(errs.pose(distance), [wide, wide, turned.var()], rtol=0.05)
     velocity = (rate[:, 0] * speed).var(axis=0)
-    wide = velocity[:2].max()
-    np.testing.assert_allclose(
-        errs.twist(speed, step / speed), [wide, wide, velocity[2]], rtol=0.05
-    )
+    if errs.sideways:
+        velocity[:2] = velocity[:2].max()
+    np.testing.assert_allclose(errs.twist(speed, step / speed), velocity, rtol=0.05)
     after = (stays[:, 0] * distance).var(axis=0)
     wide = after[:2].max()
     walked = np.array(errs.walk(speed, distance)) * distance / speed
@@ -183,7 +305,7 @@ def test_variances_are_those_of_errors_that_are_drawn(errs):
 @pytest.mark.slow
 def test_slip_is_what_wheels_go_beyond_the_body(robot):
     speed, angles, forward = top_speed(robot), np.arange(24) * np.pi / 12, np.asarray(robot.forward)
-    for k, errs in enumerate(odometry_errors(robot)):
+    for k, errs in enumerate(without_multipliers(robot)):
         missed = []
         for angle in angles:
             u = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -202,7 +324,7 @@ def test_slip_is_what_wheels_go_beyond_the_body(robot):
 @pytest.mark.parametrize("made", [doubtful, mecanum_robot])
 def test_covariances_are_those_of_the_floor_and_by_default_of_the_worst(made):
     robot = made()
-    files, errs = ros2_files(robot), odometry_errors(robot)
+    files, errs = ros2_files(robot), without_multipliers(robot)
     four = robot.wheels == 4
     controller = MECANUM if four else OMNI
     names = ("pose_covariance_diagonal", "twist_covariance_diagonal")
@@ -226,7 +348,7 @@ def test_the_filter_fuses_velocities_and_has_noise_by_floor(robot, files):
     assert len(p["odom0_config"]) == 15
     assert p["odom0"] == f"/{OMNI}/odom"
     noise = {}
-    for name, e in zip(identifiers(robot.labels, "floor"), odometry_errors(robot), strict=True):
+    for name, e in zip(identifiers(robot.labels, "floor"), without_multipliers(robot), strict=True):
         own = parameters(files, f"floors/{name}.yaml", EKF)
         assert list(own) == ["process_noise_covariance"]
         matrix = np.reshape(own["process_noise_covariance"], (15, 15))

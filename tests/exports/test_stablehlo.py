@@ -13,8 +13,7 @@ import pytest
 from slipid.deploy.controllers import control_loop_of
 from slipid.exports.stablehlo import FILES, SCHEMA, load_program, stablehlo_files
 from slipid.lab.trial.controllers import ROWS
-from slipid.robot.closed_loop import PERIOD
-from slipid.robot.interface import Readings
+from slipid.robot.interface import PERIOD, Readings
 from slipid.support.errors import DataError
 from tests.helpers import small_twin
 

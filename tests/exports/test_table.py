@@ -11,7 +11,7 @@ import pytest
 
 from slipid.exports.description import HEAD, gains_origin, table_files
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.gains import Gains
+from slipid.robot.gains import Gains, used_gains
 from slipid.robot.limits import Limits
 from slipid.robot.record import ActuatorRecord, LimitsRecord, Setting
 from slipid.robot.robot_file import declared_numbers
@@ -42,7 +42,7 @@ def test_every_number_reads_back_to_the_last_bit(made):
     assert values(rows, "inverse") == np.ravel(robot.inverse).tolist()
     assert values(rows, "wheel_curve") == np.ravel(robot.wheel_curve).tolist()
     gains, limits = Gains.of(robot), Limits()
-    assert values(rows, "gains") == [float(x) for x in vars(gains).values()]
+    assert values(rows, "gains") == [float(e.get(gains)) for e in used_gains(robot)]
     assert values(rows, "limits") == list(vars(limits).values())
     assert values(rows, "motor")[0] == robot.record.wheels.gear_ratio
     for e in declared_numbers(robot.record):

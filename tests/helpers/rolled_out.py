@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.robot.closed_loop import PERIOD, ControlLoop, ControlLoopOutput, ControlLoopState
-from slipid.robot.interface import Pose, Readings, State
+from slipid.robot.closed_loop import ControlLoop, ControlLoopOutput, ControlLoopState
+from slipid.robot.interface import PERIOD, Pose, Readings, State
 from slipid.robot.trajectory import Path
 from slipid.robot.twin import Twin, TwinState
 

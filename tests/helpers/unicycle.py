@@ -3,9 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import RobotArrays
-from slipid.robot.interface import Measurement, Pose
+from slipid.robot.interface import PERIOD, Measurement, Pose
 
 
 class Unicycle:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from slipid.model.geometry import differential, skid_steer
 from slipid.model.kinematics import Steering
 from slipid.model.robot import build, steady_states
 from slipid.robot.controller import RESPONSE_S, Controller
@@ -109,7 +110,7 @@ def test_no_single_wheel_speeds_up_on_a_floor_that_is_believed_under_it_alone(ro
         belief = np.zeros((robot.wheels, 3))
         belief[:, 0], belief[soft] = 1.0, (0.0, 1.0, 0.0)
         believed = replace(estimate, surface_probability=jnp.asarray(belief))
-        return np.asarray(controller._wheel_speeds(twist, believed))
+        return np.asarray(controller._wheel_speeds(twist, believed, jnp.zeros((), bool)))
 
     np.testing.assert_allclose(wheels(0), wheels(robot.wheels - 1), atol=1e-12)
     assert np.abs(wheels(0) - wheels(slice(None))).max() > 1e-3
@@ -148,8 +149,26 @@ def test_a_robot_that_cannot_go_sideways_reaches_its_reference(truth):
         for start in starts:
             x, y, yaw = np.asarray(end(start, jnp.asarray(rates)))
             # a reference at rest is reached to where the robot no longer turns towards it
-            assert np.hypot(x, y) < (0.055 if rates[0] == 0 else 0.06), (rates, start)
+            most = 0.055 + float(controller._sideways()) if rates[0] == 0 else 0.06
+            assert np.hypot(x, y) < most, (rates, start)
             assert abs(yaw) < 0.25, (rates, start)
+
+
+def test_a_robot_that_turns_about_another_point_than_its_middle_does_not_turn_for_that():
+    """A turn moves the middle by up to half the distance between the axles, again and again."""
+    skid, pair = (
+        Controller(deploy_known(build(shape, ["firm"])), Gains())
+        for shape in (skid_steer(0.15, 0.2, 0.1), differential(0.2, 0.1))
+    )
+
+    def yaw_rate(controller, y):
+        ref, gap = jnp.zeros(6), jnp.array([0.0, -y])
+        return float(controller._tangent_pose_loop(ref, jnp.zeros(3), gap, jnp.zeros(2))[2])
+
+    assert [float(c._sideways()) for c in (skid, pair)] == pytest.approx([0.15, 0.0])
+    assert [yaw_rate(skid, 0.17), yaw_rate(pair, 0.02)] == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert yaw_rate(skid, 0.24) < -1.0
+    assert yaw_rate(pair, 0.17) < -1.0
 
 
 def test_wheels_answer_as_late_as_the_record_says(robot):

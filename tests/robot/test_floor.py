@@ -88,8 +88,10 @@ def believed(by_pose, after, before):
     by_floor, hypotheses = FloorFilter(robot, SETTINGS), hypotheses_of(robot).under
     state = by_pose.init(jnp.zeros(3), (0.2, 0.1))
     none, still = jnp.zeros(3), TimeStep(jnp.asarray(0.05), jnp.zeros((), bool), jnp.zeros(()))
-    currents = MotorCurrents(none, jnp.zeros(3, int), jnp.ones(3))
-    _, motion = by_floor.step(by_floor.init(), none, currents, jnp.asarray(jnp.nan), still)
+    currents = MotorCurrents(none, jnp.zeros(3, int), jnp.ones(3), jnp.zeros(()))
+    begin = by_floor.init()
+    of = by_floor.predict(begin, none)
+    _, motion = by_floor.step(begin, of, currents, jnp.asarray(jnp.nan), still)
     motion = replace(motion, known=after, before=before)
     root, supports = by_pose.mapped(state, HALVES, hypotheses)
     return state, *apply_map(state, root, supports, motion)

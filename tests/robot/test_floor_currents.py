@@ -71,7 +71,9 @@ def test_evidence_is_that_of_normal_errors_of_the_readings(turn):
     xi = 0.2 * rng.normal(size=(shape[0], 3))
     predicted = 0.5 + 0.3 * rng.normal(size=shape)
     amps, heard = np.array([0.4, -0.7, 0.1]), np.array([2, 1, 0])
-    currents = MotorCurrents(jnp.asarray(amps), jnp.asarray(heard), jnp.full(3, 1e-3))
+    currents = MotorCurrents(
+        jnp.asarray(amps), jnp.asarray(heard), jnp.full(3, 1e-3), jnp.zeros(())
+    )
     w = jnp.array([3.0, 0.1, -2.0])
     told, none = floors._evidence(
         jnp.asarray(xi), jnp.asarray(predicted), currents, w, jnp.asarray(turn)

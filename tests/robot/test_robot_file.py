@@ -247,11 +247,14 @@ def test_an_older_file_whose_law_was_another_is_to_be_written_anew(path):
 
 def as_schema_7(content: dict) -> None:
     """Change the content of a file into what the version before wrote."""
-    added = ("limits.", "sensors.", "actuators.", "loads.inverse_kinematics")
+    added = ("limits.", "sensors.", "actuators.", "loads.inverse_kinematics", "nominal")
+    added += ("floors.calibration",)
     units = {k: v for k, v in content["units"].items() if not k.startswith(added)}
     sensors = {k: v for k, v in content["sensors"].items() if isinstance(v, bool)}
     content.update(schema="slipid.robot/7", units=units, sensors=sensors)
-    del content["limits"], content["actuators"]
+    del content["limits"], content["actuators"], content["nominal"]
+    for floor in content["floors"]:
+        del floor["calibration"]
     for load in content["loads"]:
         del load["inverse_kinematics"]
 

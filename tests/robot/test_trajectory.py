@@ -130,6 +130,21 @@ def test_a_path_waits_for_a_heading_that_lags_and_not_for_one_that_is_ahead():
         assert waited(turn, arm=0.0) == pytest.approx(0.0)
 
 
+def test_a_path_waits_for_a_lag_and_not_for_a_tolerated_distance_to_the_side():
+    path = tangent([Section(1.0)], pause=0.0)
+    now = jnp.asarray(2.0)
+    here = np.asarray(path.at(now))[:3]
+
+    def waited(x, y):
+        later, _ = path.follow(now, jnp.asarray(here) + jnp.array([x, y, 0.0]), 0.05, 0.0, 0.2, 0.1)
+        return 1.0 - float(later - now) / 0.05
+
+    assert waited(0.0, 0.1) == waited(0.0, -0.09) == pytest.approx(0.0)
+    assert waited(0.0, 0.17) == pytest.approx(0.5, abs=1e-3)
+    assert waited(-0.07, 0.1) == pytest.approx(0.5, abs=1e-3)
+    assert waited(0.2, 0.0) == pytest.approx(0.0)  # ahead
+
+
 def test_a_preview_is_of_the_rates_alone():
     path = trajectory.waypoints([(0.0, 0.0), (1.0, 0.0)], pause=0.0)
     now = jnp.asarray(path.duration - 0.35)  # it brakes for 0.4 s

@@ -1,17 +1,23 @@
 """The twin: wheels, body, noise and sensors, its derivatives, and that it is a plant."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from slipid.model import contact
+from slipid.model.geometry import skid_steer
+from slipid.model.robot import build
 from slipid.robot.closed_loop import ControlLoop, Plant, run_closed_loop
 from slipid.robot.controller import Controller
+from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Odometry
 from slipid.robot.gains import Gains
 from slipid.robot.trajectory import waypoints
 from slipid.robot.twin import KEPT_COMMANDS, ActuatorModel, Twin, TwinPlant
+from tests.helpers.known_robot import deploy_known
 from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor, stacked
 
@@ -73,6 +79,31 @@ def test_a_body_at_constant_speed_moves_as_the_contact_says():
         pose = np.asarray(state.pose)
         gone = np.hypot(*(pose[-1] - pose[-2])[:2]) / 0.05
         assert gone == pytest.approx(float(jnp.hypot(xi[0], xi[1])), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_body_on_a_calibrated_floor_moves_by_its_kinematics():
+    """One motor a side; on both floors at once, and on the other floor, forces decide."""
+    robot = deploy_known(build(skid_steer(0.15, 0.2, 0.1, drive_of=(0, 1, 0, 1)), ["firm", "soft"]))
+    rows = ((0.04, 0.04), (0.005, -0.005), (-0.1, 0.1))
+    firm, soft = robot.record.floors
+    known = replace(firm, kinematics=rows)
+    robot = DeployedRobot.of(replace(robot.record, floors=(known, soft)))
+    command = jnp.array([2.0, 4.0])
+    on_firm, on_soft, across = (
+        Twin(robot, floor(cells), SILENT) for cells in ([[0]], [[1]], [[0, 1], [0, 1]])
+    )
+    state, reading = driven(on_firm, jnp.tile(command, (30, 1)))
+    np.testing.assert_allclose(state.twist[-1], [0.24, -0.01, 0.2], rtol=1e-6)
+    assert reading.wheel_angle.shape == reading.current.shape == (30, 2)
+    np.testing.assert_allclose(np.diff(reading.wheel_angle[-2:], axis=0)[0] / 0.05, command)
+    balance = robot.standing(jnp.full(4, 1)).twist(jnp.array([2.0, 4.0, 2.0, 4.0]))
+    state, _ = driven(on_soft, jnp.tile(command, (30, 1)))
+    np.testing.assert_allclose(state.twist[-1], balance, atol=1e-6)
+    astride = robot.standing(jnp.array([1, 1, 0, 0])).twist(jnp.array([2.0, 4.0, 2.0, 4.0]))
+    np.testing.assert_allclose(
+        across._twist(across.floor.under(jnp.zeros(3), robot.places), command), astride, atol=1e-6
+    )
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
-"""Limits and noise of sensors that the logs of a robot show.
+"""Limits, noise of sensors, and delays of wheels that the logs of a robot show.
 
 Limits are the highest values that were driven, without the few rows that exceed all others. Noise
 is what sensors show while the wheels rest. A quantity of which the logs show too little is left
-out.
+out. For delays see `slipid.data.wheel_response`.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from slipid.data.log import Log
+from slipid.data.wheel_response import wheel_response
 from slipid.data.wheel_signals import interpolate, stretches
 from slipid.model.geometry import Geometry
 
@@ -45,7 +46,9 @@ STALE_GAPS, STALE_S = 5.0, (0.2, 1.0)
 
 
 def own_settings(logs: Sequence[Log], shape: Geometry) -> dict[str, float]:
-    """Return limits and noise that logs show, keyed by path in robot.json, rounded to 3 digits.
+    """Return limits, noise and delays that logs show, rounded to 3 digits.
+
+    Keys are paths in robot.json.
 
     Args:
         logs: the runs; those without motion of wheels are ignored.
@@ -53,7 +56,10 @@ def own_settings(logs: Sequence[Log], shape: Geometry) -> dict[str, float]:
     """
     driven = [log for log in logs if log.wheels and log.samples > 2]
     found = dict(_limits(driven, shape)) | dict(_noise(driven, float(shape.wheel_radius)))
-    return {name: float(f"{v:.3g}") for name, v in found.items() if np.isfinite(v) and v > 0}
+    found = {name: v for name, v in found.items() if np.isfinite(v) and v > 0}
+    if (response := wheel_response(driven, shape)) is not None:
+        found |= {"actuators.delay_s": response.delay_s, "actuators.lag_s": response.lag_s}
+    return {name: float(f"{v:.3g}") for name, v in found.items()}
 
 
 def _limits(logs: Sequence[Log], shape: Geometry) -> Iterator[tuple[str, float]]:
@@ -153,7 +159,7 @@ def _noise_of_meters(
             yield f"sensors.{name}", _std(parts, magnitudes)
 
 
-def _noise_of_gyro(rests: Sequence[Float[np.ndarray, " row"]]) -> Iterator[tuple[str, float]]:
+def _noise_of_gyro(rests: Sequence[Float[np.ndarray, "_"]]) -> Iterator[tuple[str, float]]:
     parts = [part for rest in rests if len(part := rest[np.isfinite(rest)]) > 2]
     std = _std(parts, magnitudes=False)
     yield "sensors.gyro_std", std
@@ -196,7 +202,7 @@ def _columns(
         yield column, new & np.isfinite(column)
 
 
-def _std(parts: Sequence[Float[np.ndarray, " reading"]], magnitudes: bool) -> float:
+def _std(parts: Sequence[Float[np.ndarray, "_"]], magnitudes: bool) -> float:
     """Return the std of noise around the mean of each part; nan if there are too few readings.
 
     Magnitudes of noise around 0 have their mean above 0, and count as readings around 0.

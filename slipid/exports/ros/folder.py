@@ -19,8 +19,9 @@ from slipid.exports.ros import localization
 from slipid.exports.ros.drive import (
     LARGEST_DIFFERENCE,
     DriveController,
-    drive_controller_of,
+    drive_controllers,
     joint,
+    rolling,
 )
 from slipid.exports.ros.localization import (
     DISTANCE_M,
@@ -32,12 +33,13 @@ from slipid.exports.ros.localization import (
     worst_of,
 )
 from slipid.exports.ros.node import NODE, node_parameters
+from slipid.exports.ros.package import package_files
 from slipid.exports.ros.yaml_text import Parameter, comment, declaration, nodes
 from slipid.exports.text import filled, identifiers, interval, short, table, template
 from slipid.robot.deployed import DeployedRobot
 
 USES: Mapping[str, str] = {
-    "drive_controller.yaml": "geometry and covariances (on the worst floor) for the drive "
+    "drive_controller.yaml": "geometry and covariances (of the worst floor) for the drive "
     "controller: enter the names of your joints, then pass the file to the spawner or the "
     "controller manager",
     "robot_localization.yaml": "parameters of the extended Kalman filter for the odometry of that "
@@ -51,9 +53,20 @@ USES: Mapping[str, str] = {
     "declares the parameters in slipid.yaml: types, descriptions with verdicts, and validators; "
     "the defaults are the identified values",
 }
-"""Use of each file, keyed by the file's name, except for the files of single floors."""
+"""Use of each file, keyed by the file's name, except for single floors and the node."""
+_NODE = {
+    "node/package.xml": "package of a node that drives the robot with cmd_vel by the estimator and "
+    "controller in C, which must be exported as well (`--to c,ros2`): copy `node` and `c` into "
+    "your workspace, next to each other below one folder",
+    "node/CMakeLists.txt": "its build: `colcon build --cmake-args -DSLIPID_C=PATH` for a folder "
+    "`c` elsewhere",
+    "node/src/slipid_node.cpp": "its source, to adapt to your drivers: `cmd_vel` (TwistStamped), "
+    "`joint_states` and `imu` in; `~/commands` (wheel speeds for a JointGroupVelocityController), "
+    "`~/odometry` and `/diagnostics` out; service `~/rearm`",
+}
 _FLOOR = (
-    "covariances of the drive controller and process noise of the filter on this floor: load this "
+    "covariances of the drive controller (for `diff_drive_controller` also multipliers of its "
+    "geometry) and process noise of the filter on this floor: load this "
     "file after `drive_controller.yaml` and `robot_localization.yaml`, whose values it overrides"
 )
 _ENCODERS = "the drive controller, which ignores slip"
@@ -69,12 +82,16 @@ def ros2_files(robot: DeployedRobot) -> dict[str, str]:
     There is no file for a drive controller if no controller of ros2_controllers has the robot's
     kinematics.
     """
-    drive, errors = drive_controller_of(robot), odometry_errors(robot)
-    worst = worst_of(errors)
+    drives, bodies = drive_controllers(robot), {}
+    alone = [d.wheel_speeds for d in drives] or [rolling(robot)] * len(robot.labels)
+    errors = odometry_errors(robot, np.stack(alone))
+    # the file without a floor has the kinematics of the worst one, wherever the robot drives
+    floor = robot.labels.index(worst_of(errors).floor)
+    worst = worst_of(odometry_errors(robot, np.stack([alone[floor]] * len(alone))))
+    drive = drives[floor] if drives else None
     parameters = node_parameters(robot)
-    bodies = {}
     if drive is not None:
-        listed = (*drive.parameters, *_covariances(robot, drive, worst))
+        listed = (*drive.parameters, *drive.by_floor, *_covariances(robot, drive, worst))
         bodies["drive_controller.yaml"] = nodes([(drive.name, listed)])
     known = worst_of(tuple(e.without_slip() for e in errors))
     stated = list(diagonal(known.twist(top_speed(robot), PERIOD_S)))
@@ -88,14 +105,15 @@ def ros2_files(robot: DeployedRobot) -> dict[str, str]:
     bodies["slipid.yaml"] = nodes([(NODE, parameters)])
     bodies["slipid_parameters.yaml"] = declaration(NODE, parameters)
     uses = {name: USES[name] for name in bodies}
-    for label, e in zip(identifiers(robot.labels, "floor"), errors, strict=True):
-        covariances = [(drive.name, _covariances(robot, drive, e))] if drive is not None else []
+    for k, (label, e) in enumerate(zip(identifiers(robot.labels, "floor"), errors, strict=True)):
+        own = [(d.name, (*d.by_floor, *_covariances(robot, d, e))) for d in drives[k : k + 1]]
         noise = (localization.process_noise(robot, e),)
-        bodies[f"floors/{label}.yaml"] = nodes([*covariances, (localization.FILTER_NODE, noise)])
+        bodies[f"floors/{label}.yaml"] = nodes([*own, (localization.FILTER_NODE, noise)])
         uses[f"floors/{label}.yaml"] = _FLOOR
     head = comment(header(robot))
     files = {name: "\n".join([*head, *body]) + "\n" for name, body in bodies.items()}
-    return {"README.md": _readme(robot, drive, errors, uses), **files}
+    files |= package_files(robot, stated)
+    return {"README.md": _readme(robot, drive, errors, uses | _NODE), **files}
 
 
 def _covariances(
@@ -117,6 +135,12 @@ def _covariances(
         f"Variances of velocities [m^2/s^2, rad^2/s^2]: (effect^2 + slip^2) v^2 + process^2 v / T "
         f"at v = {short(speed)} m/s, the highest rim speed of the fitted runs, and a message every "
         f"T = {short(PERIOD_S)} s."
+        + (
+            ""
+            if e.sideways
+            else " The sideways velocity is that of "
+            "the sideslip, which the pose does not include: turning back undoes it."
+        )
     )
     variances = e.pose(DISTANCE_M), e.twist(speed, PERIOD_S)
     return tuple(
@@ -154,9 +178,14 @@ def _controller(drive: DriveController | None) -> str:
     """Return the paragraphs about the controller manager and the controller's kinematics."""
     if drive is None:
         return filled("ros2/no_drive.md", {"SHARE": f"{LARGEST_DIFFERENCE:.0%}"}).rstrip()
+    missing = (
+        "one radius for each side and one wheel separation"
+        if drive.by_floor
+        else "no parameters for drive directions of single wheels"
+    )
     difference = (
         f"differ from the identified kinematics by at most {short(100 * drive.difference)} % of a "
-        "rim speed, since the controller has no parameters for drive directions of single wheels."
+        f"rim speed, since the controller has {missing}."
     )
     values = {
         "NAME": drive.name,
@@ -180,7 +209,8 @@ def _wheels(robot: DeployedRobot, drive: DriveController | None) -> list[str]:
         where = ", ".join(short(x) for x in (np.round(places[k], 9) + 0.0).tolist())
         ahead = f"{short(float((angle + 180) % 360 - 180))} deg"
         sign = "" if drive is None else "**REVERSE**" if reverse else "as it is"
-        rows.append((f"wheel {k + 1}", f"`{joint(k)}`", where, ahead, free, sign))
+        motor = f", drive {robot.drive_of[k] + 1}" if robot.drive_of else ""
+        rows.append((f"wheel {k + 1}{motor}", f"`{joint(k)}`", where, ahead, free, sign))
     head = ("robot.json", "joint", "x, y [m]", "drives to", "rollers", "sign for the controller")
     warning = ["", template("ros2/reverse.md").rstrip()] if any(turned) else []
     return [*table(head, rows), *warning]
@@ -203,8 +233,8 @@ def _odometry(robot: DeployedRobot, errors: tuple[OdometryErrors, ...]) -> list[
 
 
 def _stds(variances: Sequence[float]) -> str:
-    x, _, yaw = (short(v**0.5) for v in variances)
-    return f"{x}, {yaw}"
+    x, y, yaw = (short(v**0.5) for v in variances)
+    return f"{x}, {yaw}" if x == y else f"{x}, {y}, {yaw}"
 
 
 def _names(robot: DeployedRobot) -> list[str]:

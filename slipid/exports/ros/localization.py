@@ -3,10 +3,14 @@
 Over a path length d [m] an error has a constant part (std e of the effect [m/m, rad/m]) and a
 random part (std q of the process noise [m/sqrt(m), rad/sqrt(m)]), so that its variance is
 (e d)^2 + q^2 d. For odometry that ignores slip, the slip of the wheels is an error as well: e^2 is
-then effect^2 + slip^2, where slip is the root mean square of the contact model's slip over
-directions of travel. A constant covariance cannot depend on the direction of travel, so x and y
-both get the larger of the variances along and across. A wrong heading moves the robot sideways;
-with the values e_w and q_w of e and q in yaw, this adds the variance
+then effect^2 + slip^2, where slip is the root mean square difference, over the motions that the
+robot can make, of the motion that a drive controller computes from the wheels and that of the
+robot's model. A constant covariance cannot depend on the direction of travel, so x and y both get
+the larger of the variances along and across; only the velocity of a robot that cannot drive
+sideways always has the same direction in its own frame. Such a robot slips sideways as it turns
+about a centre of rotation ahead of or behind its origin: turning back undoes this shift of the
+origin, so that it counts in the velocity but not in the pose. A wrong heading moves the robot
+sideways; with the values e_w and q_w of e and q in yaw, this adds the variance
 (e_w d^2 / 2)^2 + q_w^2 d^3 / 3 across.
 
 ROS drive controllers put one constant diagonal into every message, although the true covariance of
@@ -56,17 +60,20 @@ class OdometryErrors:
         effect: std of the contact model's effects [m/m], [m/m], [rad/m].
         slip: root mean square slip of the wheels, which odometry from encoders ignores [m/m],
             [m/m], [rad/m].
+        sideways: True if the robot can drive sideways.
     """
 
     floor: str
     process: Axes
     effect: Axes
     slip: Axes
+    sideways: bool = True
 
     @property
     def constant(self) -> Axes:
         """Std of the constant error (effect and slip) per metre of path [m/m, m/m, rad/m]."""
-        return axes_of(np.hypot(self.effect, self.slip))
+        along, across, yaw = self.slip
+        return axes_of(np.hypot(self.effect, (along, across * self.sideways, yaw)))
 
     def without_slip(self) -> "OdometryErrors":
         """Return the errors of odometry that estimates slip: only the contact model's errors."""
@@ -85,8 +92,9 @@ class OdometryErrors:
 
         At the speed v [m/s] the variances are (e v)^2 + q^2 v / period.
         """
-        e, q = np.asarray(self.constant), np.asarray(self.process)
-        return _larger_in_plane((e * speed) ** 2 + q**2 * speed / period)
+        e, q = np.hypot(self.effect, self.slip), np.asarray(self.process)
+        variances = (e * speed) ** 2 + q**2 * speed / period
+        return _larger_in_plane(variances) if self.sideways else axes_of(variances)
 
     def walk(self, speed: float, distance: float) -> Axes:
         """Return the variances per second of a random walk that replaces the constant error.
@@ -97,12 +105,19 @@ class OdometryErrors:
         return _larger_in_plane(np.asarray(self.constant) ** 2 * distance * speed)
 
 
-def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
-    """Return the errors of odometry on each floor, in the order of the robot's `labels`."""
-    slip = np.asarray(_slip(robot.arrays, jnp.asarray(top_speed(robot))))
-    process, effect = np.asarray(robot.process), np.asarray(robot.effect)
+def odometry_errors(
+    robot: DeployedRobot, wheel_speeds: Float[np.ndarray, "floor drive 3"]
+) -> tuple[OdometryErrors, ...]:
+    """Return the errors of odometry on each floor, in the order of the robot's `labels`.
+
+    `wheel_speeds` are the matrices from a body twist to wheel speeds that the odometry assumes on
+    the floors [rad/m, rad/m, 1].
+    """
+    slip = _slip(robot.arrays, jnp.asarray(wheel_speeds), jnp.asarray(top_speed(robot)))
+    rows = (robot.process, robot.effect, np.round(slip, 12))
+    process, effect, lost = (list(map(axes_of, np.asarray(x))) for x in rows)
     return tuple(
-        OdometryErrors(name, axes_of(process[k]), axes_of(effect[k]), axes_of(slip[k]))
+        OdometryErrors(name, process[k], effect[k], lost[k], robot.holonomic)
         for k, name in enumerate(robot.labels)
     )
 
@@ -124,18 +139,35 @@ def diagonal(planar: Axes) -> tuple[float, ...]:
 
 
 @eqx.filter_jit
-def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"]:
-    """Return the root mean square slip on each floor, along, across [m/m] and in yaw [rad/m]."""
-    angle = jnp.linspace(0.0, 2 * jnp.pi, DIRECTIONS, endpoint=False)
-    twist = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(DIRECTIONS)], axis=-1)
-    rim = speed * twist @ robot.forward.T
+def _slip(
+    robot: RobotArrays, wheel_speeds: Float[Array, "floor drive 3"], speed: Float[Array, ""]
+) -> Float[Array, "floor 3"]:
+    """Return the root mean square slip on each floor, along, across [m/m] and in yaw [rad/m].
 
-    def one(floor: ContactSurface) -> Array:
-        return jax.vmap(lambda r: contact.equilibrium(r, robot.frame, floor, robot.rest))(rim)
+    A robot that cannot drive sideways drives ahead and back, and turns on the spot or on the way;
+    its slip is per metre that its wheels roll.
+    """
+    if robot.holonomic:
+        angle = jnp.linspace(0.0, 2 * jnp.pi, DIRECTIONS, endpoint=False)
+        way = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+        twist = jnp.concatenate([way, jnp.zeros((DIRECTIONS, 1))], axis=-1)
+    else:
+        moves = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
+        moves += [(0.7 * x, 0.5 * turn) for x in (1, -1) for turn in (1, -1)]
+        ahead, turn = jnp.asarray(moves).T
+        twist = jnp.stack([ahead, jnp.zeros_like(ahead), turn / robot.frame.base], axis=-1)
+        way = jnp.tile(jnp.array([1.0, 0.0]), (len(moves), 1))
 
-    slip = twist - jax.vmap(one)(robot.floors) / speed
-    along = jnp.sum(slip * twist, axis=-1)
-    across = slip[..., 1] * twist[:, 0] - slip[..., 0] * twist[:, 1]
+    def moved(floor: ContactSurface, by_wheels: Array, kinematics: Array, known: Array) -> Array:
+        turned = speed * twist @ by_wheels.T
+        rim = robot.at_wheels(turned) * robot.frame.radius
+        forces = jax.vmap(lambda r: contact.equilibrium(r, robot.frame, floor, robot.rest))(rim)
+        return jnp.where(known, turned @ kinematics.T, forces) / speed
+
+    known = jnp.asarray(robot.calibrated)
+    slip = twist - jax.vmap(moved)(robot.floors, wheel_speeds, robot.kinematics, known)
+    along = jnp.sum(slip[..., :2] * way, axis=-1)
+    across = slip[..., 1] * way[:, 0] - slip[..., 0] * way[:, 1]
     return jnp.sqrt(jnp.mean(jnp.stack([along, across, slip[..., 2]], axis=-1) ** 2, axis=1))
 
 
@@ -169,9 +201,10 @@ def filter_parameters(
         odometry: topic of the odometry.
         source: description of the odometry's source, for a comment.
     """
+    rest = "" if robot.holonomic else _AHEAD
     about = (
         f"Odometry of {source}. Only velocities are fused, since the odometry's pose is their "
-        "integral and contains no further information. Order: " + ", ".join(STATE) + "."
+        f"integral and contains no further information. {rest}Order: {', '.join(STATE)}."
     )
     return (
         Parameter("frequency", 1 / PERIOD_S, "Assumed rate of the odometry [Hz]."),
@@ -194,12 +227,14 @@ def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
 
     The diagonal is the variance per second of each state. For the pose it is `OdometryErrors.walk`;
     for velocities it is (a T)^2 per period T [s], where a is the largest acceleration
-    [m/s^2, rad/s^2].
+    [m/s^2, rad/s^2]. Nothing accelerates a robot sideways that cannot drive sideways.
     """
     change = float(Limits.of(robot).acceleration)
     speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S
     noise = dict(zip(("x", "y", "yaw"), errors.walk(top_speed(robot), DISTANCE_M), strict=True))
-    noise |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
+    noise |= {"vx": speed, "vyaw": turn, "ax": ACCELERATION}
+    if robot.holonomic:
+        noise |= {"vy": speed, "ay": ACCELERATION}
     matrix = np.diag([noise.get(name, PLANAR_NOISE) for name in STATE])
     about = (
         f"On '{errors.floor}'. Pose: a random walk that replaces the errors that stay constant "
@@ -207,12 +242,16 @@ def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
         f"the fitted runs, {short(top_speed(robot))} m/s. Velocity: the change that the limit of "
         f"acceleration, {short(change)} m/s^2, allows within {short(PERIOD_S)} s. "
         "Accelerations: the default of robot_localization. All other states are held at zero by "
-        "two_d_mode."
+        f"{'two_d_mode' if robot.holonomic else 'two_d_mode, vy and ay by the wheels'}."
     )
     entries = tuple(matrix.reshape(-1).tolist())
     return Parameter("process_noise_covariance", entries, about, per_line=len(STATE))
 
 
+_AHEAD = (
+    "The robot cannot drive sideways, so that vy is fused as 0, with the small variance of its "
+    "sideslip. "
+)
 _TF = (
     "Only one node may publish this transform: set enable_odom_tf of the drive controller to false."
 )

@@ -1,7 +1,7 @@
 """Parameters of a ROS node `slipid`: the robot's parameters, named by their robot.json paths.
 
-Names of floors and load set-ups are converted by `identifiers`. Arrays with an element per wheel
-are in the order of robot.json; matrices are in row-major order.
+Names of floors and load set-ups are converted by `identifiers`. Arrays with an element per wheel or
+drive are in the order of robot.json; matrices are in row-major order.
 """
 
 import math
@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from slipid.exports.description import BASES, SETTINGS, gains_origin, settings, verdict_text
 from slipid.exports.ros.yaml_text import Check, Parameter
 from slipid.exports.text import identifiers, interval, listed
-from slipid.parameter import Entry, entries
+from slipid.parameter import Entry
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.gains import Gains
+from slipid.robot.gains import Gains, used_gains
 from slipid.robot.record import UNITS, RecordedNumber
 from slipid.robot.robot_file import declared_numbers
 
@@ -84,7 +84,7 @@ def _checks(e: Entry) -> Iterator[Check]:
 
 def _shape(robot: DeployedRobot) -> Iterator[Parameter]:
     """Yield the parameters of wheels and kinematics."""
-    wheels, size, matrix = robot.record.wheels, _size(robot.wheels), _size(3 * robot.wheels)
+    wheels, size, matrix = robot.record.wheels, _size(robot.wheels), _size(3 * robot.drives)
     gear = "motor speed over wheel speed n [1]"
     yield Parameter("wheels.gear_ratio", wheels.gear_ratio, gear, (Check("gt<>", (0.0,)),))
     for name, values, about, check in (
@@ -111,7 +111,7 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
     speed, current = (float(x) for x in robot.highest)
     yield Parameter("seen.highest_speed", speed, _HIGHEST_SPEED, (zero,))
     yield Parameter("seen.highest_current", current, _HIGHEST_CURRENT, (zero,))
-    yield _flat("seen.wheel_curve", robot.wheel_curve, _CURVE, _size(2 * robot.wheels))
+    yield _flat("seen.wheel_curve", robot.wheel_curve, _CURVE, _size(2 * robot.drives))
     for name, value in vars(robot.record.sensors).items():
         if isinstance(value, bool):
             yield Parameter(f"seen.{name}", value, f"{name}: true if the logs had this")
@@ -120,7 +120,7 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
 def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
     """Yield gains, limits and settings of sensors, which may be changed while the node runs."""
     gains = Gains.of(robot)
-    for e in entries(gains):
+    for e in used_gains(robot):
         about = f"{e.declaration.doc} {e.declaration.symbol} [{e.declaration.unit}]"
         if e.path == "place":
             about = f"{about}. {gains_origin(robot)}"
@@ -148,7 +148,7 @@ def _flat(
 _PLACE = "centre of each wheel, x and y, in base radii"
 _DRIVE = "direction of travel at a positive wheel speed, without drive_offset [rad]"
 _ROLLER = "angle from the free rolling direction to the drive direction [rad]"
-_FORWARD = "J: rim speed of each wheel from vx, vy [m/s], yaw rate [rad/s], a row per wheel"
+_FORWARD = "J: rim speed of each drive from vx, vy [m/s], yaw rate [rad/s], a row per drive"
 _INVERSE = "pseudo-inverse of J: vx, vy, yaw rate from rim speeds [m/s], a row for each"
 _PROCESS = (
     "std of random errors that grow with the root of the path length: along, across [m/sqrt(m)], "
@@ -159,4 +159,4 @@ _CURRENT = "std of measured less modelled currents [A]"
 _TREND = "a [A], b [A s/m] of the excess a + b v of measured over modelled currents at a speed v"
 _HIGHEST_SPEED = "highest wheel speed of the fitted runs [rad/s]"
 _HIGHEST_CURRENT = "largest modelled current at up to 0.8 of the highest wheel speed [A]"
-_CURVE = "a [1], b [1/A] of each wheel's slip ratio a + b |I| at a current I, over all floors"
+_CURVE = "a [1], b [1/A] of each drive's slip ratio a + b |I| at a current I, over all floors"

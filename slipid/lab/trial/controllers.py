@@ -1,14 +1,16 @@
 """Controllers that a trial compares: those of slipid, and published control laws."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from slipid.deploy.controllers import CONTROLLERS, PAPER_WHEELS, ControllerRow
+from slipid.deploy.controllers import CONTROLLERS, ControllerRow
 from slipid.lab.trial.published_laws import (
     GoswamiPadhy,
     Indiveri,
@@ -17,10 +19,11 @@ from slipid.lab.trial.published_laws import (
     by_swarm,
     inverse_kinematics,
 )
-from slipid.robot.closed_loop import PERIOD
+from slipid.robot.closed_loop import Plant
 from slipid.robot.controller import Law
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.gains import Gains
+from slipid.robot.interface import PERIOD, Measurement, Readings
 from slipid.robot.limits import Limits
 from slipid.robot.trajectory import ROW_PERIOD, rectangle
 from slipid.robot.twin import ActuatorModel
@@ -76,8 +79,43 @@ ROWS: Mapping[str, ControllerRow] = {
     "indiveri": ControllerRow(
         "encoder", "law of Indiveri, whose speed limit keeps the direction", law=_indiveri
     ),
+    "true_pose": ControllerRow(
+        "contact", "the controller's own limit: it is told the true pose", tuned=True, fixed=True
+    ),
 }
-"""Controllers keyed by name: slipid's and the 2021 paper's, then the published control laws."""
+"""Controllers keyed by name: slipid's and the 2021 paper's, the published control laws, and the
+limit of what an estimator can achieve."""
+FIX_STD = 1e-3
+"""Std of a true pose, as it is told to the estimator [m], [rad]."""
+
+
+class TruePosePlant:
+    """A plant whose readings contain its true pose, as a fix without delay."""
+
+    def __init__(self, plant: Plant):
+        self._plant = plant
+
+    def reset(self) -> Measurement | Readings:
+        """Return the first readings, with the pose."""
+        return self._with_pose(self._plant.reset())
+
+    def step(self, wheel_speed: Float[np.ndarray, " drive"]) -> Measurement | Readings:
+        """Return the readings one control period after a command, with the pose."""
+        return self._with_pose(self._plant.step(wheel_speed))
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """True pose [m, m, rad]."""
+        return self._plant.pose
+
+    @property
+    def power(self) -> float:
+        """Total electric power of the motors [W]; NaN if the plant does not provide it."""
+        return float(getattr(self._plant, "power", np.nan))
+
+    def _with_pose(self, reading: Measurement | Readings) -> Measurement | Readings:
+        told = jnp.asarray(self.pose), jnp.full(2, FIX_STD), jnp.zeros(())
+        return replace(reading, fix=told[0], fix_std=told[1], fix_age=told[2])
 
 
 def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
@@ -86,13 +124,11 @@ def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
     Raises:
         DataError: none of the controllers `names` can drive the robot.
     """
-    kept = tuple(name for name in names if ROWS[name].drives(robot))
+    kept = tuple(name for name in names if not ROWS[name].obstacle(robot))
     if not kept:
-        raise DataError(
-            f"{', '.join(names)}: only for robots with {PAPER_WHEELS} wheels, like that of the "
-            f"2021 paper; this robot has {robot.wheels}; expected one of "
-            f"{', '.join(name for name, row in ROWS.items() if row.drives(robot))}"
-        )
+        reasons = "; ".join(f"{name}: {ROWS[name].obstacle(robot)}" for name in names)
+        suited = [name for name, row in ROWS.items() if not row.obstacle(robot)]
+        raise DataError(f"{reasons}; expected one of {', '.join(suited)}")
     return kept
 
 
@@ -118,12 +154,11 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if tuned is None:
         return ""
     if tuned.load != robot.load_setup:
-        return f"gains were tuned for load set-up {tuned.load}: driving with hand-set gains"
+        return f"gains were tuned for load set-up {tuned.load}: they are not used"
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
-            f"{tuned.loss.hand:.1f} mm): driving with gains set by hand; use --tuned-gains for "
-            "the tuned gains"
+            f"{tuned.loss.hand:.1f} mm) and not used; use --tuned-gains for the tuned gains"
         )
     if tuned.values.ahead.value == 0.0:
         return ""

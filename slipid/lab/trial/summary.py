@@ -13,6 +13,8 @@ DRAWS = 2000
 """Number of draws of the bootstrap over starts."""
 COMPARED = ("closure_error_median", "cross_track_rmse", "first_side_along_track_mm")
 """Errors (defined in `columns`) whose medians are compared with those of controller `encoder`."""
+SENSORS = {"gyro": "a gyro", "map": "a map of the floors", "true pose": "the true pose"}
+"""Text about what a controller needs, keyed by the names in `ControllerRow.needs`."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +47,18 @@ def summaries(runs: Sequence[TrialRun]) -> dict[str, Content]:
     A summary has the medians of the errors, keyed by the names of `columns`, without those that a
     plant does not measure (the twin's energy); `interval90`, their 90 % intervals by bootstrap over
     starts; `runs`, the number of runs; and `finished_share`, the fraction of runs that reached the
-    end of the path. If the controller `encoder` was driven, a summary also has `worse_share`, the
-    fraction of starts with a larger closure error than `encoder`'s, and `to_encoder`, the ratios of
-    medians to those of `encoder`, each with its `value` and `interval90`.
+    end of the path. `recovery_share` is the fraction of runs in which the controller began to free
+    a robot that was stuck, and `freed_share` the fraction of those in which it drove on each time;
+    None without such a run. If the controller `encoder` was driven, a summary also has
+    `worse_share`, the fraction of starts with a larger closure error than `encoder`'s, and
+    `to_encoder`, the ratios of medians to those of `encoder`, each with its `value` and
+    `interval90`. If the controller
+    `calibrated` was driven, `to_calibrated` has the mean difference of the closure error to that of
+    `calibrated` from the same starts, and its standard error [mm].
     """
     of = _by_controller(runs)
     table = {name: columns(mine) for name, mine in of.items()}
-    again, base = _resampled(of), table.get("encoder")
+    again, base, calibrated = _resampled(of), table.get("encoder"), table.get("calibrated")
     out: dict[str, Content] = {}
     for name, mine in table.items():
         known = {k: v for k, v in mine.items() if np.all(np.isfinite(v))}
@@ -60,12 +67,62 @@ def summaries(runs: Sequence[TrialRun]) -> dict[str, Content]:
             "interval90": {k: _interval(np.median(v[again], axis=1)) for k, v in known.items()},
             "runs": len(of[name]),
             "finished_share": float(np.mean([run.metrics.finished for run in of[name]])),
+            **_recoveries(of[name]),
         }
         if base is not None:
             pairs = zip(mine["closure_error_median"], base["closure_error_median"], strict=False)
             out[name]["worse_share"] = float(np.mean([own > other for own, other in pairs]))
             out[name]["to_encoder"] = {k: _ratio(mine[k], base[k], again) for k in COMPARED}
+        if calibrated is not None:
+            key, count = "closure_error_median", again.shape[1]
+            apart = mine[key][:count] - calibrated[key][:count]
+            error = float(np.std(apart, ddof=1) / np.sqrt(count)) if count > 1 else float("inf")
+            out[name]["to_calibrated"] = {
+                "mean_difference_mm": float(np.mean(apart)),
+                "standard_error_mm": error if np.isfinite(error) else None,
+            }
     return out
+
+
+def _recoveries(runs: Sequence[TrialRun]) -> Content:
+    """Return the shares of runs with recoveries, and of those that drove on."""
+    drove_on = [
+        run.metrics.freed == run.metrics.recoveries for run in runs if run.metrics.recoveries
+    ]
+    return {
+        "recovery_share": len(drove_on) / len(runs),
+        "freed_share": float(np.mean(drove_on)) if drove_on else None,
+    }
+
+
+def verdict(runs: Sequence[TrialRun], needs: Mapping[str, Sequence[str]], has_gyro: bool) -> str:
+    """Return a sentence that names the controller that closes best, and what it needs.
+
+    The best controllers without these needs follow, until one needs only encoders and ammeters.
+
+    Args:
+        runs: runs of all controllers to compare.
+        needs: what each controller needs, see `ControllerRow.needs`, keyed by its name.
+        has_gyro: True if the logs of the robot have a gyro.
+    """
+    parts, without = [], []
+    while True:
+        left = [run for run in runs if not set(needs[run.controller]) & set(without)]
+        if not left:
+            break
+        best, *equal = best_controllers(left)
+        lack = "" if has_gyro or "gyro" not in needs[best] else ", which your logs do not have"
+        text = best
+        if needs[best]:
+            text += f" (with {' and '.join(SENSORS[name] for name in needs[best])}{lack})"
+        if equal:
+            text += f", not told apart from {', '.join(equal)}"
+        names = " and without ".join(SENSORS[name] for name in without)
+        parts.append(f"without {names}: {text}" if without else f"closes best: {text}")
+        if not needs[best]:
+            break
+        without += needs[best]
+    return "; ".join(parts)
 
 
 def best_controllers(runs: Sequence[TrialRun]) -> tuple[str, ...]:

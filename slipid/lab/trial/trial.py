@@ -4,6 +4,7 @@ The plant, which simulates the robot, is the virtual test site, or a twin with p
 the posterior.
 """
 
+import json
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields, replace
@@ -28,12 +29,18 @@ from slipid.deploy.twin_run import (
     twin_floor,
     twin_plant,
 )
+from slipid.lab.testsite.config import plan
 from slipid.lab.testsite.driving import PERIOD, RimSpeeds
 from slipid.lab.testsite.plant import SimulatedRobot
-from slipid.lab.testsite.site import Site, SiteSensors
-from slipid.lab.testsite.surfaces import SURFACES
-from slipid.lab.trial.controllers import ROWS, applicable, check_gains, unused_gains
-from slipid.lab.trial.summary import TrialRun, best_controllers, summaries
+from slipid.lab.testsite.site import Site
+from slipid.lab.trial.controllers import (
+    ROWS,
+    TruePosePlant,
+    applicable,
+    check_gains,
+    unused_gains,
+)
+from slipid.lab.trial.summary import TrialRun, best_controllers, summaries, verdict
 from slipid.robot import closed_loop, trajectory
 from slipid.robot.deployed import DeployedRobot, posterior_robots
 from slipid.robot.gains import Gains
@@ -46,10 +53,13 @@ from slipid.support.executor import results
 from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
+from slipid.support.toml_file import text_of
 
 SCHEMA = "slipid.trial/1"
 FOLDER = "trial"
 """Name of the folder of finished runs, in the result folder."""
+SAME_PLACE = 0.2
+"""Largest distance of a wheel of the test site's robot from that of the fit, in base radii [1]."""
 PLANTS = ("testsite", "twin")
 
 
@@ -67,6 +77,7 @@ class TrialTask:
         floor: map of the floor on which the robot drives.
         known_map: map of the floor that is given to controllers.
         robot: identified robot.
+        site: the test site; unused for the twin.
         settings: settings of the estimator.
         actuators: delay, lag and limits of the twin's wheel speeds.
         forced: True if tuned gains are used even if they are no better than hand-set ones.
@@ -82,6 +93,7 @@ class TrialTask:
     floor: FloorMap
     known_map: FloorMap
     robot: DeployedRobot
+    site: Site
     settings: Settings
     actuators: ActuatorModel
     forced: bool
@@ -95,6 +107,8 @@ class TrialOptions:
     Attributes:
         plant: `testsite` (MuJoCo) or `twin` (the identified model itself, with parameters drawn
             anew from the posterior for every start).
+        site: config of `slipid simulate` with the robot and the surfaces of the test site; None for
+            the built-in robot with three omni wheels.
         map: file of the map of the floor on which the robot drives; None for patches of the
             identified floors.
         told_map: file of the map that is given to controllers with a map; None for the true one.
@@ -107,6 +121,7 @@ class TrialOptions:
     """
 
     plant: str = "testsite"
+    site: Path | None = None
     map: Path | None = None
     told_map: Path | None = None
     controllers: tuple[str, ...] = tuple(ROWS)
@@ -143,14 +158,18 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
 
     Raises:
         DataError: there is no fit in the folder; the plant, a controller, the path, the load set-up
-            or a map does not exist; MuJoCo is missing; a floor is unknown to the plant or the fit;
-            or the speed is higher than that of any fitted run.
+            or a map does not exist; MuJoCo is missing; the test site has another robot; a floor is
+            unknown to the plant or the fit; or the speed is higher than that of any fitted run.
     """
     setup_jax(quiet=True)
     tasks = _tasks(out, options)
     rows = tuple(dict.fromkeys(task.row for task in tasks))
-    if unsuited := [name for name in options.controllers if name not in rows]:
-        report.line(f"omitted, because they need three wheels: {', '.join(unsuited)}")
+    omitted: dict[str, list[str]] = {}
+    for name in options.controllers:
+        if obstacle := ROWS[name].obstacle(tasks[0].robot):
+            omitted.setdefault(obstacle, []).append(name)
+    for obstacle, names in omitted.items():
+        report.line(f"omitted: {', '.join(names)} ({obstacle})")
     if unused := unused_gains(tasks[0].robot, options.tuned_gains):
         report.line(unused)
     todo = {task.name: task for task in tasks if _finished_run(task) is None}
@@ -158,10 +177,14 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     results(executor, drive, todo, report)
     driven = {task.name: found for task in tasks if (found := _finished_run(task)) is not None}
     runs = [run for run, _ in driven.values()]
-    best = list(best_controllers(runs))
+    # the true pose is a limit, not a competitor, unless it is the only row
+    compared = [run for run in runs if not ROWS[run.controller].fixed] or runs
+    best = list(best_controllers(compared))
+    needs = {name: ROWS[name].needs for name in rows}
     content = {
         "schema": SCHEMA,
         "plant": options.plant,
+        "site": None if options.site is None else str(options.site),
         "map": "patches" if options.map is None else str(options.map),
         "told_map": None if options.told_map is None else str(options.told_map),
         "path": options.path,
@@ -169,6 +192,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
         "gains": _gains(tasks[0].robot, options.tuned_gains),
         "closes_best": None if len(best) > 1 else best[0],
         "not_told_apart": best,
+        "verdict": verdict(compared, needs, tasks[0].robot.record.sensors.gyro),
         "summary": summaries(runs),
         "controllers": {name: ROWS[name].about for name in rows},
         "runs": [run.to_json() for run in runs],
@@ -190,10 +214,12 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     floor = twin_floor(robot) if options.map is None else read_map(options.map)
     known_map = floor if options.told_map is None else read_map(options.told_map)
     settings, actuators = Settings.of(robot), actuator_model_of(robot, gyro=False)
+    site = Site() if options.site is None else plan(options.site, text_of(options.site)).site
     # the test site has its own sensors and actuators, whatever the logged robot had
     if options.plant == "testsite":
-        refuse_unknown_to_site(floor, robot.load_setup, robot.wheels)
-        settings, actuators = replace(settings, current_is_signed=False), ActuatorModel()
+        refuse_unknown_to_site(site, floor, robot)
+        settings = replace(settings, current_is_signed=site.sensors.current_is_signed)
+        actuators = ActuatorModel()
     else:
         require_known_surfaces(floor, robot, str(options.map))
     if options.told_map is not None:
@@ -203,16 +229,17 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     gains = _gains(robot, options.tuned_gains)
     about = options.plant, options.path, options.speed, robot.load_setup, gains
     key = key_of(
-        *(*about, settings, actuators, *jax.tree.leaves(robot)),
+        *(*about, json.dumps(site.to_json()), settings, actuators, *jax.tree.leaves(robot)),
         *(part for m in (floor, known_map) for part in (m.surfaces, m.corner, m.cell, m.cells)),
         # a hash of the code, so that runs of another version of it are not reused
         source_hash("robot", "model", "lab/testsite", "data", "deploy", "lab/trial"),
     )
     # trials with other gains or floors have separate folders, so that their runs stay reusable
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{options.starts}", key)
-    shared = options.plant, floor, known_map, robot, settings, actuators, options.tuned_gains, kept
+    shared = options.plant, floor, known_map, robot, site, settings, actuators
+    forced = options.tuned_gains
     return [
-        TrialTask(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared)
+        TrialTask(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared, forced, kept)
         for row in applicable(options.controllers, robot)
         for k, start in enumerate(starts(options.starts, floor, path))
     ]
@@ -242,9 +269,14 @@ def drive(task: TrialTask) -> None:
             truth, task.floor, task.start, task.seed, replace(task.actuators, gyro=row.gyro)
         )
     else:
-        plant = SitePlant(task.floor, robot.load_setup, task.start, task.seed, row.gyro)
+        sensors = replace(task.site.sensors, gyro=row.gyro)
+        site = replace(task.site, sensors=sensors)
+        plant = SitePlant(site, task.floor, robot.load_setup, task.start, task.seed)
+    if row.fixed:
+        plant = TruePosePlant(plant)
     there = floor_of(task.known_map, robot.labels)
-    loop = control_loop_of(robot, row, task.settings, task.forced, there)
+    sees = row.gyro or row.fixed
+    loop = control_loop_of(robot, row, task.settings, task.forced, there, recovery=sees)
     driven = closed_loop.run_closed_loop(loop, path, plant, task.start)
     off = driven.pose[-1] - driven.estimated_pose[-1]
     run = TrialRun(
@@ -267,15 +299,28 @@ def controller_names(text: str | None) -> tuple[str, ...]:
     return tuple(dict.fromkeys(t.strip() for t in text.split(",") if t.strip()))
 
 
-def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
-    """Raise `DataError` if the test site lacks a surface or load set-up, or `wheels` differs."""
-    robot, other = Site().robot, "Use --plant twin, which simulates the identified model itself"
-    has = len(robot.places)
-    if wheels != has:
-        raise DataError(f"the test site's robot has {has} wheels, the fit's {wheels}. {other}")
+def refuse_unknown_to_site(site: Site, floor: FloorMap, robot: DeployedRobot) -> None:
+    """Raise `DataError` if the test site has another robot, or lacks a surface or load set-up."""
+    other = "Use --plant twin, which simulates the identified model itself"
+    build, drives = site.robot, robot.drive_of or tuple(range(robot.wheels))
+    ours, theirs = np.asarray(robot.places), build.places
+    near = SAME_PLACE * float(robot.frame.base)
+    if (
+        len(ours) != len(theirs)
+        or drives != build.drive_of
+        or robot.holonomic != (build.drive == "omni")
+        or np.abs(ours - theirs).max() > near
+    ):
+        kinds = "" if robot.holonomic else " that cannot drive sideways"
+        raise DataError(
+            f"the test site's robot ({build.drive}) has {len(theirs)} wheels and {build.drives} "
+            f"motors, but the fit is of a robot{kinds} with {len(ours)} wheels and {robot.drives} "
+            "motors, or with wheels in other places. Name the config with which `slipid simulate` "
+            f"made the logs by --site, such as --site configs/testsite_skid.toml. {other}"
+        )
     for what, name, there in (
-        ("load set-up", load, robot.centres_m),
-        *(("surface", name, SURFACES) for name in floor.surfaces),
+        ("load set-up", robot.load_setup, build.centres_m),
+        *(("surface", name, site.surfaces) for name in floor.surfaces),
     ):
         if name not in there:
             raise DataError(
@@ -289,17 +334,17 @@ class SitePlant:
     Commands take effect after the site's delay, and with limited acceleration.
 
     Args:
+        site: robot, sensors and surfaces of the site.
         floor: map of the surfaces.
         load: name of the load set-up.
         start: start pose: x, y [m], heading [rad].
         seed: seed of the floor's unevenness, the initial wheel angles and sensor noise.
-        gyro: True if the robot has a gyro.
     """
 
     def __init__(
-        self, floor: FloorMap, load: str, start: tuple[float, float, float], seed: int, gyro: bool
+        self, site: Site, floor: FloorMap, load: str, start: tuple[float, float, float], seed: int
     ):
-        self._site = Site(sensors=SiteSensors(gyro=gyro))
+        self._site = site
         self._new, self._seed = partial(SimulatedRobot, self._site, floor, load, start, seed), seed
         self.reset()
 
@@ -322,7 +367,7 @@ class SitePlant:
         self._bias = self._site.sensors.gyro_bias * float(self._rng.normal())
         return self._read(np.zeros((1, 2 * len(self.plant.wheel_dof))))
 
-    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Measurement:
+    def step(self, wheel_speed: Float[np.ndarray, " drive"]) -> Measurement:
         """Command wheel speeds [rad/s], advance by one period, and return the new measurement."""
         plant, drive, rows = self.plant, self.plant.drive, []
         self._rims.send(np.asarray(wheel_speed, float))

@@ -42,6 +42,13 @@ from slipid.robot.interface import Settings
 INERTIA_ACCELERATION = 30.0
 """Wheel acceleration at which evidence on floors has half its weight, since the contact equilibrium
 neglects inertia [rad/s^2]."""
+CHANGE = 0.1
+"""Probability that the floors have changed without being noticed, for the plausibility of a gyro
+[1]."""
+SLIP = 0.05
+"""Std of slip that no floor explains, as a fraction of the rim speed, for the same purpose [1]."""
+UNKNOWN_EFFECT = 0.3
+"""Std of the yaw that an unknown floor causes, for the same purpose [rad/m]."""
 
 
 class TimeStep(eqx.Module):
@@ -108,6 +115,28 @@ class BodyMotion(eqx.Module):
     correction: Float[Array, "3"]
 
 
+class Prediction(eqx.Module):
+    """What every hypothesis predicts at the wheel speeds of a step.
+
+    Attributes:
+        wheel_speed: wheel speed of every drive [rad/s].
+        settled: twist by contact equilibrium, without effects [m/s, m/s, rad/s].
+        twist: twist with the mean effects, or by calibrated kinematics [m/s, m/s, rad/s].
+        amps: motor currents [A].
+        rolling: twist of the body if no wheel slipped [m/s, m/s, rad/s].
+        rolled: direction and speed of `rolling`.
+        part: remaining fraction of the std of every floor's effects [1].
+    """
+
+    wheel_speed: Float[Array, " drive"]
+    settled: Float[Array, "hypothesis 3"]
+    twist: Float[Array, "hypothesis 3"]
+    amps: Float[Array, "hypothesis drive"]
+    rolling: Float[Array, "3"]
+    rolled: RolledMotion
+    part: Float[Array, "floor 3"]
+
+
 class FloorFilter(eqx.Module):
     """Filter over the floors under the wheels.
 
@@ -146,10 +175,43 @@ class FloorFilter(eqx.Module):
         )
         return weight / jnp.sum(weight)
 
+    def predict(self, old: FloorState, w: Float[Array, " drive"]) -> Prediction:
+        """Return what every hypothesis predicts at the wheel speeds `w` [rad/s]."""
+        settled, amps = self.solve(old.twist, w)
+        f, hypotheses = self.robot, hypotheses_of(self.robot)
+        rolling = f.inverse @ (f.frame.radius * w)
+        if f.steering is not None:
+            rolling = settled[hypotheses.uniform[0]]
+        rolled = RolledMotion.of(rolling, f.frame.base)
+        mean, part = f.effect_table.at(rolled)
+        # add mean effects only to hypotheses with all wheels on one floor: only these were fitted
+        effect = rolled.speed * mean @ rolled.axes.T
+        twist = settled + jnp.zeros((len(hypotheses), 3)).at[hypotheses.uniform].set(effect)
+        if f.steering is None and any(f.calibrated):
+            floors = np.flatnonzero(f.calibrated)
+            twist = twist.at[hypotheses.uniform[floors]].set(f.kinematics[floors] @ w)
+        return Prediction(w, settled, twist, amps, rolling, rolled, part)
+
+    def yaw_rate(self, old: FloorState, of: Prediction, tick: TimeStep) -> tuple[Array, Array]:
+        """Return the predicted yaw rate [rad/s] and its variance [rad^2/s^2].
+
+        The variance includes that of hypotheses which become likely when the floor changes, and of
+        slip that none of them explains.
+        """
+        f, yaw = self.robot, of.twist[:, 2]
+        known = old.belief[:-1] / jnp.maximum(jnp.sum(old.belief[:-1]), 1e-12)
+        mean = known @ yaw
+        over = (1 - CHANGE) * known + CHANGE * old.expected
+        unknown = UNKNOWN_EFFECT * old.belief[-1] + SLIP / f.frame.base
+        per_metre = unknown**2 + jnp.max(f.effect[:, 2]) ** 2
+        speed, walk = of.rolled.speed, jnp.max(f.process[:, 2]) ** 2
+        var = per_metre * speed**2 + walk * speed / jnp.maximum(tick.dt, 1e-3)
+        return mean, over @ (yaw - mean) ** 2 + var
+
     def step(
         self,
         old: FloorState,
-        w: Array,
+        of: Prediction,
         currents: MotorCurrents,
         turn: Array,
         tick: TimeStep,
@@ -159,29 +221,18 @@ class FloorFilter(eqx.Module):
 
         Args:
             old: belief before the step.
-            w: wheel speed of every drive [rad/s].
+            of: what the hypotheses predict in this step.
             currents: motor currents.
             turn: gyro's yaw rate less its bias; NaN without a gyro [rad/s].
             tick: the time step.
             mapped: probability that a floor map gives every hypothesis at the robot's pose; None
                 without a map.
         """
-        settled, predicted = self.solve(old.twist, w)
-        f, hypotheses = self.robot, hypotheses_of(self.robot)
-        rolling = f.inverse @ (f.frame.radius * w)
+        f, hypotheses, w, xi = self.robot, hypotheses_of(self.robot), of.wheel_speed, of.twist
         if f.steering is not None:
             # no motor is modelled, so that currents tell nothing of the floor
-            rolling = settled[hypotheses.uniform[0]]
             currents = replace(currents, measured=jnp.zeros_like(currents.measured))
-        rolled = RolledMotion.of(rolling, f.frame.base)
-        mean, part = f.effect_table.at(rolled)
-        # add mean effects only to hypotheses with all wheels on one floor: only these were fitted
-        effect = rolled.speed * mean @ rolled.axes.T
-        xi = settled + jnp.zeros((len(hypotheses), 3)).at[hypotheses.uniform].set(effect)
-        if f.steering is None and any(f.calibrated):
-            floors = np.flatnonzero(f.calibrated)
-            xi = xi.at[hypotheses.uniform[floors]].set(f.kinematics[floors] @ w)
-        known_log, unknown_log = self._evidence(xi, predicted, currents, w, turn)
+        known_log, unknown_log = self._evidence(xi, of.amps, currents, w, turn)
         # give evidence less weight while wheels accelerate, since the equilibrium neglects inertia
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
         weight = weight / (1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2)
@@ -196,10 +247,10 @@ class FloorFilter(eqx.Module):
         motion = BodyMotion(
             twist=middle,
             scatter=(xi - middle).T @ (known[:, None] * (xi - middle)),
-            rolling=rolling,
-            rolled=rolled,
-            left=f.effect * self._remaining_std(part, known, under),
-            by_friction=self._by_friction(known @ settled, w, under),
+            rolling=of.rolling,
+            rolled=of.rolled,
+            left=f.effect * self._remaining_std(of.part, known, under),
+            by_friction=self._by_friction(known @ of.settled, w, under),
             known=known,
             before=before,
             under=under,
@@ -208,7 +259,7 @@ class FloorFilter(eqx.Module):
             * ((known - before) @ xi),
         )
         expected = old.expected if mapped is None else mapped
-        return FloorState(belief, expected, twist=settled, apart=apart), motion
+        return FloorState(belief, expected, twist=of.settled, apart=apart), motion
 
     def _remaining_std(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Return the remaining std of every floor's effects as a fraction of the whole std [1].

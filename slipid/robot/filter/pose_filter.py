@@ -27,8 +27,10 @@ from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.effects import effect_correlation, travel_direction
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import INERTIA_ACCELERATION, BodyMotion, TimeStep, length
+from slipid.robot.filter.gyro import LEAST_STD
 from slipid.robot.filter.pose_fix import (
     HISTORY_STEPS,
+    FixState,
     PoseState,
     apply_fix,
     history_after_jump,
@@ -88,6 +90,46 @@ class PoseFilter(eqx.Module):
             far=jnp.zeros(()),
             push=jnp.zeros((3, 4 * floors + 3)),
             history=jnp.broadcast_to(entry, (HISTORY_STEPS, 15)),
+            fixes=FixState.init(),
+        )
+
+    def gyro_gap(
+        self, now: PoseState, gyro: Array, yaw: Array, var: Array, tick: TimeStep
+    ) -> tuple[Array, Array]:
+        """Return the difference of a gyro from the model's yaw rate, and its variance.
+
+        The model's yaw rate counts as an interval: from its value in the last step, or when the
+        reading was taken, to the present one.
+
+        Args:
+            now: state before the step.
+            gyro: yaw rate by the gyro [rad/s].
+            yaw: the model's present yaw rate [rad/s].
+            var: variance of `yaw` over the floors [rad^2/s^2].
+            tick: the time step.
+        """
+        then, before = self._yaw_rate_then(now, yaw), now.history[0, 4]
+        low = jnp.minimum(jnp.minimum(then, before), yaw)
+        high = jnp.maximum(jnp.maximum(then, before), yaw)
+        turn = gyro - now.nuisance[-1]
+        var = var + self.settings.gyro_std**2 + LEAST_STD**2
+        var = var * (1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2)
+        return turn - jnp.clip(turn, low, high), var + now.covariance[-1, -1]
+
+    def turned(self, now: PoseState, turn: Array, doubt: Array) -> PoseState:
+        """Return the state after a robot was turned otherwise than the model predicted.
+
+        Args:
+            now: state before.
+            turn: rotation that is believed; the robot may have been moved as well [rad].
+            doubt: rotation that may have happened or not [rad].
+        """
+        aside = self.robot.frame.base * turn
+        more = jnp.diag(jnp.stack([aside, aside, doubt]) ** 2)
+        return replace(
+            now,
+            pose=now.pose.at[2].add(turn),
+            covariance=now.covariance.at[:3, :3].add(more),
         )
 
     def mapped(
@@ -258,6 +300,7 @@ class PoseFilter(eqx.Module):
             covariance=jnp.concatenate([pose_rows, rest]),
             noise=old.noise + noise,
             far=old.far + far,
+            fixes=replace(old.fixes, far=jnp.minimum(old.fixes.far + far, 1e3)),
             push=jnp.where(far > 1e-6, push / jnp.maximum(body.speed, 1e-9), old.push),
         )
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.robot.filter.floor import SPREAD
 from slipid.robot.filter.floor_filter import BodyMotion
@@ -18,6 +18,71 @@ MAP_EXPONENT = 0.25
 """Exponent applied to the likelihood of a pose, which follows from the belief about floors [1]. It
 is below 1 because an error of the map affects many steps, so that the evidence of these steps is
 not independent."""
+
+
+MOST_STDS = 6.0
+"""Distance of a pose fix from the expected pose above which it is set aside [1]."""
+AGREEING_FIXES = 3
+"""Number of pose fixes in a row that are believed against the estimate if they agree."""
+DRIFT = (0.1, 0.3)
+"""Std of the motion between two pose fixes that are compared [m/m], [rad/m]."""
+
+
+class FixState(eqx.Module):
+    """Pose fixes that contradict the estimate.
+
+    Attributes:
+        fix: last fix that was set aside [m, m, rad].
+        std: its std of position [m] and heading [rad].
+        pose: estimated pose at the time of that fix [m, m, rad].
+        far: path length since then [m].
+        agreeing: number of fixes in a row that were set aside and agree with each other.
+        rejected: number of fixes that were set aside since the start.
+    """
+
+    fix: Float[Array, "3"]
+    std: Float[Array, "2"]
+    pose: Float[Array, "3"]
+    far: Float[Array, ""]
+    agreeing: Float[Array, ""]
+    rejected: Float[Array, ""]
+
+    @classmethod
+    def init(cls) -> "FixState":
+        """Return the state before the first fix."""
+        zero = jnp.zeros(())
+        return cls(jnp.zeros(3), jnp.ones(2), jnp.zeros(3), zero, zero, zero)
+
+    def after(
+        self, fix: Array, std: Array, pose: Array, fits: Bool[Array, ""]
+    ) -> tuple["FixState", Bool[Array, ""]]:
+        """Return the state after a fix, and whether it is believed against the estimate.
+
+        Args:
+            fix: the fix [m, m, rad].
+            std: its std of position [m] and heading [rad].
+            pose: estimated pose at the time of the fix [m, m, rad].
+            fits: True if the fix does not contradict the estimate.
+        """
+        gone, turn = pose[:2] - self.pose[:2], wrapped(self.fix[2] - self.pose[2])
+        c, s = jnp.cos(turn), jnp.sin(turn)
+        expected = self.fix[:2] + jnp.stack([c * gone[0] - s * gone[1], s * gone[0] + c * gone[1]])
+        gap = jnp.append(fix[:2] - expected, wrapped(fix[2] - pose[2] - turn))
+        var = self.std**2 + std**2 + (jnp.array(DRIFT) * self.far) ** 2
+        across = self.std[1] ** 2 * (gone @ gone)  # by the error of the first fix's heading
+        far = gap[:2] @ gap[:2] / (var[0] + across) + gap[2] ** 2 / var[1]
+        same = (self.agreeing > 0) & (far < MOST_STDS**2)
+        agreeing = jnp.where(same, jnp.minimum(self.agreeing + 1.0, AGREEING_FIXES), 1.0)
+        believed = ~fits & (agreeing >= AGREEING_FIXES)
+        new = FixState(
+            fix=fix,
+            std=std,
+            pose=pose,
+            far=jnp.zeros(()),
+            agreeing=jnp.where(fits | believed, 0.0, agreeing),
+            rejected=self.rejected + ~(fits | believed),
+        )
+        return new, believed
 
 
 class PoseState(eqx.Module):
@@ -38,6 +103,7 @@ class PoseState(eqx.Module):
             of the last motion [m/m, m/m, rad/m].
         history: last steps, the newest first. Columns: age [s], pose [m, m, rad], yaw rate of the
             contact model [rad/s], `noise` in row-major order and `far` [m] after the step.
+        fixes: pose fixes that contradict the estimate.
     """
 
     pose: Float[Array, "3"]
@@ -49,35 +115,35 @@ class PoseState(eqx.Module):
     far: Float[Array, ""]
     push: Float[Array, "3 push"]
     history: Float[Array, "entry 15"]
+    fixes: FixState
 
 
 def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
     """Return the state corrected by a pose fix, if there is one, and a matrix (3, 3).
 
-    The caller must multiply the distance of each hypothesis's pose from the estimated pose, in
-    world axes, by the matrix. Without a fix the matrix is the identity.
+    A fix more than `MOST_STDS` stds from the expected pose is set aside. If as many as
+    `AGREEING_FIXES` in a row agree with each other, the pose moves to the last of them. The caller
+    must multiply the distance of each hypothesis's pose from the estimated pose, in world axes, by
+    the matrix. Without a fix the matrix is the identity.
     """
     age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
     has = (
         jnp.all(jnp.isfinite(z.fix))
-        & jnp.all(jnp.abs(z.fix[:2]) < 1e4)
+        & jnp.all(jnp.abs(z.fix) < 1e4)
         & jnp.all(jnp.isfinite(z.fix_std))
         & jnp.all(z.fix_std > 0)
         & (age < now.history[-1, 0] + 1e-6)
     )
     std = jnp.clip(z.fix_std, 1e-4, 10.0)
-    same = now.pose, now.nuisance, now.covariance, now.history, jnp.eye(3)
-    pose, nuisance, covariance, history, left = jax.lax.cond(
-        has, lambda: _corrected(now, z.fix, std, age), lambda: same
+    return jax.lax.cond(
+        has, lambda: _corrected(now, z.fix, std, age), lambda: (now, jnp.eye(3, dtype=float))
     )
-    new = replace(now, pose=pose, nuisance=nuisance, covariance=covariance, history=history)
-    return new, left
 
 
 def _corrected(
     now: PoseState, fix: Array, std: Array, age: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return pose, nuisance, covariance, history and the matrix of `apply_fix` after a pose fix.
+) -> tuple[PoseState, Float[Array, "3 3"]]:
+    """Return the state and the matrix of `apply_fix` after a pose fix.
 
     The fix measures the pose at the time `age` [s] ago. Between that time and now, nuisance states
     are assumed to act on the pose as they did in the last motion. The fix contains no information
@@ -93,7 +159,7 @@ def _corrected(
     aside = jnp.zeros_like(cov).at[:3, :3].set(held)
     cov = cov - aside
     gap = fix - then[1:4]
-    gap = gap.at[2].set(jnp.arctan2(jnp.sin(gap[2]), jnp.cos(gap[2])))
+    gap = gap.at[2].set(wrapped(gap[2]))
     gone = pose[:2] - then[1:3]
     look = jnp.zeros((3, cov.shape[0])).at[:, :3].set(jnp.eye(3))
     look = look.at[0, 2].set(gone[1]).at[1, 2].set(-gone[0])
@@ -101,16 +167,51 @@ def _corrected(
     noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
     rows = look @ cov
     total = rows @ look.T + noise
-    # enlarge the noise of a fix more than 3 stds from the expected pose, instead of rejecting it
     far = gap @ _inverse(total) @ gap
-    total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
-    gain = rows.T @ _inverse(total)
+    fits = far < MOST_STDS**2
+    fixes, believed = now.fixes.after(fix, std, then[1:4], fits)
+    # enlarge the noise of a fix more than 3 stds from the expected pose
+    total = total + noise * jnp.maximum((far / 9.0) ** 2 - 1.0, 0.0)
+    gain = jnp.where(fits, rows.T @ _inverse(total), 0.0)
     change = gain @ gap
     cov = cov - gain @ rows
     cov = 0.5 * (cov + cov.T) + aside
     history = shifted(history, pose, jnp.broadcast_to(change[:3], (len(history), 3)))
+    corrected = replace(
+        now,
+        pose=pose + change[:3],
+        nuisance=now.nuisance + change[3:],
+        covariance=cov,
+        history=history,
+        fixes=fixes,
+    )
     left = jnp.eye(3) - gain[:3] @ look[:, :3]
-    return pose + change[:3], now.nuisance + change[3:], cov, history, left
+    moved = _moved_to(corrected, fix, then[1:4], std), jnp.zeros((3, 3))
+    return jax.tree.map(lambda a, b: jnp.where(believed, b, a), (corrected, left), moved)
+
+
+def _moved_to(
+    now: PoseState, fix: Float[Array, "3"], then: Float[Array, "3"], std: Float[Array, "2"]
+) -> PoseState:
+    """Return the state with the path moved and turned so that the pose `then` becomes `fix`.
+
+    The pose's covariance becomes that of the fix, with noise since the oldest entry of the history.
+    """
+    turn = wrapped(fix[2] - then[2])
+    c, s = jnp.cos(turn), jnp.sin(turn)
+
+    def at(poses: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+        x, y = poses[..., 0] - then[0], poses[..., 1] - then[1]
+        moved = fix[0] + c * x - s * y, fix[1] + s * x + c * y, poses[..., 2] + turn
+        return jnp.stack(moved, axis=-1)
+
+    pose = at(now.pose)
+    gone = pose[:2] - fix[:2]
+    by = jnp.eye(3).at[0, 2].set(-gone[1]).at[1, 2].set(gone[0])
+    var = by @ jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) @ by.T + now.noise
+    cov = now.covariance.at[:3].set(0.0).at[:, :3].set(0.0).at[:3, :3].set(var)
+    history = now.history.at[:, 1:4].set(at(now.history[:, 1:4]))
+    return replace(now, pose=pose, covariance=cov, history=history)
 
 
 def apply_map(
@@ -230,6 +331,11 @@ def rebased(now: PoseState) -> PoseState:
     return replace(
         now, history=history, noise=now.noise - first[:9].reshape(3, 3), far=now.far - first[9]
     )
+
+
+def wrapped(angle: Float[Array, ""]) -> Float[Array, ""]:
+    """Return an angle between -pi and pi [rad]."""
+    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
 
 
 def nearest(history: Array, age: Array | float) -> Array:

@@ -77,6 +77,20 @@ def test_a_spike_of_one_row_is_no_limit():
     assert found["limits.acceleration"] == pytest.approx(0.8 / 0.4, rel=0.2)
 
 
+def test_a_log_that_was_cut_while_driving_shows_no_sudden_stop():
+    cut = [
+        replace(
+            log,
+            **{
+                name: getattr(log, name)[150:200]
+                for name in ("time", "wheel_angle", "current", "voltage", "gyro")
+            },
+        )
+        for log in LOGS
+    ]
+    assert own_settings(cut, SHAPE).get("limits.acceleration", 0.0) < 0.3
+
+
 def test_magnitudes_of_noise_around_0_show_all_of_it():
     unsigned = [replace(log, current=np.abs(log.current), current_is_signed=False) for log in LOGS]
     found = own_settings(unsigned, SHAPE)

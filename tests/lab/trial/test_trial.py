@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,13 +14,21 @@ from slipid.data.floor_map import four_zones, uniform, write_map
 from slipid.deploy.controllers import control_loop_of
 from slipid.deploy.floors import floor_map, floor_of
 from slipid.deploy.twin_run import path_of, starts
+from slipid.lab.testsite.config import plan
 from slipid.lab.testsite.driving import PERIOD
+from slipid.lab.testsite.site import Site, SiteSensors
 from slipid.lab.trial import trial as tr
-from slipid.lab.trial.controllers import ROWS, check_gains, unused_gains
+from slipid.lab.trial.controllers import (
+    ROWS,
+    TruePosePlant,
+    applicable,
+    check_gains,
+    unused_gains,
+)
 from slipid.lab.trial.published_laws import GoswamiPadhy
-from slipid.lab.trial.summary import TrialRun, best_controllers, columns, summaries
+from slipid.lab.trial.summary import TrialRun, best_controllers, columns, summaries, verdict
 from slipid.lab.trial.trial import SitePlant, drawn_robot, refuse_unknown_to_site
-from slipid.model.geometry import differential, mecanum, omni
+from slipid.model.geometry import differential, mecanum, omni, skid_steer
 from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot import trajectory as reference
@@ -35,9 +44,13 @@ from slipid.robot.interface import Measurement, Settings
 from slipid.robot.record import GainRecord, GainsRecord, GainValues, Losses
 from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
+from slipid.support.toml_file import text_of
 from tests.helpers.floors import surface_at
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.unicycle import Unicycle
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+GYRO_SITE = Site(sensors=SiteSensors(gyro=True))
 
 
 @pytest.fixture(scope="module")
@@ -193,11 +206,11 @@ def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
     tuned = Gains(*TUNED)
     robot = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
     for row in ROWS.values():
-        if row.law is not None:  # it takes a second to make
+        if row.law is not None or row.obstacle(robot):  # a law takes a second to make
             continue
         found = control_loop_of(robot, row).controller.gains
         expected = tuned if row.tuned else Gains()
-        if row.observer != "contact":
+        if row.observer in ("encoder", "curve"):
             expected = replace(expected, preview=jnp.asarray(0.0))
         assert values(found) == values(expected)
 
@@ -406,11 +419,10 @@ def test_impossible_trials_are_refused(tmp_path, deployed, pair):
     with pytest.raises(DataError, match="no controller 'magic'; expected one of encoder"):
         tr._tasks(tmp_path, tr.TrialOptions(controllers=("magic",)))
     with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
-        refuse_unknown_to_site(uniform("gray"), "as_built", 3)
+        refuse_unknown_to_site(Site(), uniform("gray"), deployed)
+    far = replace(deployed, load_setup="far")
     with pytest.raises(DataError, match="no load set-up 'far'; it has as_built"):
-        refuse_unknown_to_site(uniform("firm"), "far", 3)
-    with pytest.raises(DataError, match="has 3 wheels, the fit's 4"):
-        refuse_unknown_to_site(uniform("firm"), "as_built", 4)
+        refuse_unknown_to_site(Site(), uniform("firm"), far)
     with pytest.raises(DataError, match="no controller; expected one of encoder"):
         tr._tasks(tmp_path, tr.TrialOptions(controllers=tr.controller_names(",")))
     assert tr.controller_names("contact, encoder,contact") == ("contact", "encoder")
@@ -431,6 +443,84 @@ def test_impossible_trials_are_refused(tmp_path, deployed, pair):
     assert path_of("circle", 0.3, deployed).duration < path_of("circle", 0.1, deployed).duration
     with pytest.raises(DataError, match=r"robot\.json: missing; write it by `slipid identify`"):
         tr._tasks(tmp_path, tr.TrialOptions())
+
+
+def test_the_site_has_the_robot_of_a_config(deployed):
+    firm = uniform("firm")
+    config = CONFIGS / "testsite_skid.toml"
+    site, shape = plan(config, text_of(config)).site, (0.131, 0.187, 0.098)
+    skid, motors, other = (
+        deploy_known(build(skid_steer(*sizes, drive_of=drive_of), ["firm"]))
+        for sizes, drive_of in (
+            (shape, (0, 1, 0, 1)),
+            (shape, ()),
+            ((0.2, 0.187, 0.098), (0, 1, 0, 1)),
+        )
+    )
+    refuse_unknown_to_site(Site(), firm, deployed)
+    refuse_unknown_to_site(site, firm, skid)
+    for there, robot in ((Site(), skid), (site, motors), (site, other), (site, deployed)):
+        with pytest.raises(DataError, match=r"by --site, such as --site configs/testsite_skid"):
+            refuse_unknown_to_site(there, firm, robot)
+    plant = SitePlant(site, firm, "as_built", (0.0, 0.0, 0.0), 1)
+    for _ in range(20):
+        reading = plant.step(np.array([2.0, 2.0]))
+    assert reading.wheel_angle.shape == reading.current.shape == (2,)
+    assert np.ptp(np.asarray(reading.wheel_angle)) < 0.02
+    assert plant.pose[0] > 0.1
+    assert np.isfinite(reading.gyro)  # as in its config
+
+
+def test_rows_that_suit_a_robot_without_sideways_motion():
+    skid = deploy_known(build(skid_steer(0.13, 0.19, 0.1, drive_of=(0, 1, 0, 1)), ["firm"]))
+    kept = applicable(tuple(ROWS), skid)
+    rows = ("encoder", "contact", "contact_hand", "contact_map", "contact_gyro", "true_pose")
+    assert kept == rows
+    for name in ("slip_odometry", "torque", "indiveri", "goswami_padhy"):
+        with pytest.raises(DataError, match=f"{name}: only for robots .* one of encoder, contact"):
+            applicable((name,), skid)
+        with pytest.raises(DataError, match="expected another controller"):
+            control_loop_of(skid, ROWS[name])
+    with pytest.raises(DataError, match=r"calibrated: robot\.json has no calibration"):
+        applicable(("calibrated",), skid)
+
+
+def test_odometry_rolls_by_the_lengths_of_its_row():
+    """Nominal lengths, the mean of calibrated ones over floors, and wheel speeds that undo them."""
+    known = deploy_known(build(differential(0.2, 0.1), ["firm", "soft"]), highest_speed=20.0)
+    nominal = ((0.05, 0.05), (0.0, 0.0), (-0.25, 0.25))
+    firm, soft = (((0.05 * k, 0.05 * k), (0.01, -0.01), (-0.2 * k, 0.2 * k)) for k in (0.9, 0.7))
+    floors = [
+        replace(floor, calibration=rows)
+        for floor, rows in zip(known.record.floors, (firm, soft), strict=True)
+    ]
+    robot = DeployedRobot.of(replace(known.record, floors=tuple(floors), nominal=nominal))
+    assert "calibrated" in applicable(tuple(ROWS), robot)
+    for name, ahead, turn in (("encoder", 0.05, 0.25), ("calibrated", 0.04, 0.16)):
+        loop = control_loop_of(robot, ROWS[name])
+        odometry, state = loop.estimator, loop.estimator.init()
+        for k in range(60):
+            angle = 0.05 * k * np.array([1.0, 2.0])
+            state, seen = odometry.step(state, Measurement(wheel_angle=angle), 0.05)
+        np.testing.assert_allclose(seen.twist[jnp.array([0, 2])], [3 * ahead, turn], rtol=1e-6)
+        wheels = loop.controller._wheel_speeds(jnp.array([0.3, 0.0, 0.4]), seen)
+        left, right = 0.15 / ahead - 0.2 / turn, 0.15 / ahead + 0.2 / turn
+        np.testing.assert_allclose(wheels, [left, right], rtol=1e-6)
+
+
+def test_a_robot_that_is_told_its_true_pose(deployed):
+    plant = TruePosePlant(Unicycle(deployed, (0.3, -0.2, 0.5)))
+    assert isinstance(plant, closed_loop.Plant)
+    reading = plant.reset()
+    np.testing.assert_allclose(reading.fix, (0.3, -0.2, 0.5))
+    for _ in range(30):
+        reading = plant.step(np.full(3, 2.0))
+    np.testing.assert_allclose(reading.fix, plant.pose)
+    assert plant.pose[2] > 0.6
+    filled = reading.filled(3)
+    assert (filled.fix_std < 0.002).all()
+    assert float(filled.fix_age) == 0.0
+    assert np.isnan(plant.power)
 
 
 @pytest.mark.slow
@@ -477,7 +567,7 @@ def test_a_controller_can_have_another_map_than_the_true_one(tmp_path, deployed,
     class Told(Exception):
         pass
 
-    def caught(robot, row, settings, forced, floor):
+    def caught(robot, row, settings, forced, floor, recovery):
         raise Told(floor)
 
     monkeypatch.setattr(tr, "control_loop_of", caught)
@@ -513,7 +603,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
     assert unused_gains(tuned, forced=False) == ""
     other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
     assert values(Controller(other).gains) == values(Gains())
-    assert "tuned for load set-up far: driving with hand-set gains" in unused_gains(other, False)
+    assert "tuned for load set-up far: they are not used" in unused_gains(other, False)
     with pytest.raises(DataError, match=r"another load set-up \(far\), not for as_built; omit"):
         check_gains(tmp_path, other)
     with pytest.raises(DataError, match="the robot has no tuned gains; omit --tuned-gains"):
@@ -539,7 +629,7 @@ def test_a_file_with_a_removed_gain_drives_with_the_others_and_that_is_reported(
     assert "tuned gain ahead = 0.7 is ignored" in unused_gains(robot, forced=False)
 
 
-def run_of(name, k, closure, finished=True):
+def run_of(name, k, closure, finished=True, recoveries=0, freed=0):
     """A run whose numbers follow from its closure."""
     metrics = closed_loop.PathMetrics(
         along_track_mm=(-90.0 * (1 + 0.1 * k), 0.0, 0.0, 0.0),
@@ -552,6 +642,8 @@ def run_of(name, k, closure, finished=True):
         effort=0.1,
         seconds=19.0,
         finished=finished,
+        recoveries=recoveries,
+        freed=freed,
     )
     return TrialRun(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
 
@@ -571,6 +663,55 @@ def test_the_best_controller_follows_from_differences_over_the_same_starts():
     stuck = [*two[:-1], run_of("contact", 19, 1.0, finished=False)]
     assert best_controllers(one + stuck) == ("encoder",)
     assert best_controllers(one) == ("encoder",)
+
+
+def test_the_verdict_names_what_the_best_controllers_need():
+    rng = np.random.default_rng(0)
+    base = rng.uniform(50, 500, 20)
+    needs = {name: ROWS[name].needs for name in ROWS}
+
+    def said(gyro=False, **factors):
+        pairs = ((n, f * np.ones(20) if np.isscalar(f) else f) for n, f in factors.items())
+        runs = [run_of(n, k, float(c)) for n, f in pairs for k, c in enumerate(f * base)]
+        return verdict(runs, needs, gyro)
+
+    noise = rng.uniform(0.7, 1.25, 20)
+    rows = {"encoder": 2.0, "calibrated": 1.0, "contact": noise, "contact_gyro": 0.2}
+    assert said(**rows) == (
+        "closes best: contact_gyro (with a gyro, which your logs do not have); without a gyro: "
+        f"{'contact' if np.median(noise * base) < np.median(base) else 'calibrated'}, not told "
+        f"apart from {'calibrated' if np.median(noise * base) < np.median(base) else 'contact'}"
+    )
+    assert said(True, **rows).startswith("closes best: contact_gyro (with a gyro); without")
+    assert said(encoder=1.0, contact=0.5) == "closes best: contact"
+    assert said(encoder=1.0, contact_map=0.2, contact_gyro=0.4) == (
+        "closes best: contact_map (with a map of the floors); without a map of the floors: "
+        "contact_gyro (with a gyro, which your logs do not have); without a map of the floors and "
+        "without a gyro: encoder"
+    )
+    assert said(contact_gyro=1.0) == (
+        "closes best: contact_gyro (with a gyro, which your logs do not have)"
+    )
+
+
+def test_differences_to_calibrated_odometry_and_recoveries_are_summarised():
+    base = np.linspace(100.0, 119.0, 20)
+    runs = [run_of("calibrated", k, c) for k, c in enumerate(base)]
+    apart = np.where(np.arange(20) % 2, -10.0, -30.0)
+    tried = [(0, 0)] * 12 + [(2, 2)] * 6 + [(2, 1)] * 2
+    runs += [
+        run_of("contact", k, c, recoveries=tries, freed=freed)
+        for k, (c, (tries, freed)) in enumerate(zip(base + apart, tried, strict=True))
+    ]
+    found = summaries(runs)
+    told = found["contact"]["to_calibrated"]
+    assert told["mean_difference_mm"] == pytest.approx(-20.0)
+    assert told["standard_error_mm"] == pytest.approx(10.0 / np.sqrt(19))
+    assert found["calibrated"]["to_calibrated"]["mean_difference_mm"] == 0.0
+    assert found["contact"]["recovery_share"] == 0.4
+    assert found["contact"]["freed_share"] == 0.75
+    assert found["calibrated"]["recovery_share"] == 0.0
+    assert found["calibrated"]["freed_share"] is None
 
 
 def test_the_summary_is_of_medians_over_starts_with_intervals():
@@ -600,7 +741,7 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
 
 
 def test_live_readings_are_as_the_sensors_log_them():
-    live = SitePlant(uniform("firm"), "as_built", (0.0, 0.0, 0.0), 1, gyro=False)
+    live = SitePlant(Site(), uniform("firm"), "as_built", (0.0, 0.0, 0.0), 1)
     forward = live.plant.robot.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
     for _ in range(20):
         reading = live.step(forward)
@@ -616,7 +757,7 @@ def test_live_readings_are_as_the_sensors_log_them():
 
 @pytest.mark.slow
 def test_a_plant_that_is_reset_starts_anew():
-    plant = SitePlant(uniform("firm"), "as_built", (0.2, 0.1, 0.3), 1, gyro=True)
+    plant = SitePlant(GYRO_SITE, uniform("firm"), "as_built", (0.2, 0.1, 0.3), 1)
     first = jax.tree.leaves(plant.reset())
     begin = plant.pose
     for _ in range(10):
