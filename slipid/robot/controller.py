@@ -316,17 +316,19 @@ class Controller(eqx.Module):
     ) -> Float[Array, " drive"]:
         """Return the wheel speeds that move the body with a twist on the floors believed [rad/s].
 
-        On an unknown floor the wheels are assumed to roll without slip. So are those of a robot
-        that can drive sideways and pursues a reference: its pose loop corrects slip by itself, and
+        The matrices of the floors are averaged over the belief under all wheels: how much a wheel
+        slips depends on its own floor and on the drag that the floors of the others cause. On an
+        unknown floor the wheels are assumed to roll without slip. So are those of a robot that can
+        drive sideways and pursues a reference: its pose loop corrects slip by itself, and
         compensation by a belief about floors that may be wrong does not bring it nearer.
         """
         f = self.robot
-        under = f.on_average(e.surface_probability[:, :-1].T)
+        under = jnp.mean(e.surface_probability[:, :-1], axis=0)
         if f.holonomic:
             under = jnp.where(pursues, 0.0, under)
+        slipping = jnp.sum(under[:, None] * (f.inverse_kinematics @ twist), axis=0)
         rolling = f.forward @ twist / f.frame.radius
-        slipping = jnp.sum(under * (f.inverse_kinematics @ twist), axis=0)
-        wheels = slipping + (1 - jnp.sum(under, axis=0)) * rolling
+        wheels = slipping + (1 - jnp.sum(under)) * rolling
         return jnp.where(jnp.isfinite(wheels), wheels, 0.0)
 
     def _limited_twist(self, wanted: Array) -> Float[Array, "3"]:

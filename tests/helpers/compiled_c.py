@@ -32,7 +32,7 @@ void slipid_many(int32_t count, slipid_estimator *estimator, slipid_controller *
   for (int32_t k = 0; k < count; ++k) {
     slipid_observe(&estimator[k], &reading[k], dt[k], &estimate[k]);
     slipid_command(&controller[k], &reference[6 * k], &estimate[k], dt[k],
-                   &command[SLIPID_WHEELS * k]);
+                   &command[SLIPID_DRIVES * k]);
   }
 }
 """
@@ -81,19 +81,24 @@ class CompiledC:
     """A control loop's code, compiled: its structs as numpy records, its functions on them.
 
     Attributes:
-        code: that was compiled; kinds: of its numbers.
+        code: that was compiled; kinds: of its numbers; library: it, with `more` C functions.
         estimator, controller, reading, estimate: records that the functions work on.
     """
 
     def __init__(
-        self, code: Code, folder: Path, flags: Sequence[str] = QUICK, compiler: str = "cc"
+        self,
+        code: Code,
+        folder: Path,
+        flags: Sequence[str] = QUICK,
+        compiler: str = "cc",
+        more: str = "",
     ):
         self.code = code
         single = "-DSLIPID_FLOAT" in flags
         self.kinds = Kinds(np.float32 if single else np.float64)
         self._number = ctypes.c_float if single else ctypes.c_double
-        text = code.header(), code.source() + MANY
-        self._library = _built((*text, compiler, *flags), folder)
+        text = code.header(), code.source() + MANY + more
+        self.library = _built((*text, compiler, *flags), folder)
         self.estimator = np.zeros((), self.kinds.of(code.estimator))
         self.controller = np.zeros((), self.kinds.of(code.controller))
         self.reading = np.zeros((), self.kinds.of(code.reading))
@@ -140,7 +145,7 @@ class CompiledC:
             given = [np.ascontiguousarray(x, self.kinds.real) for x in (reference, dt)]
         arrays = (estimator, controller, reading, *given, said, command)
         pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in arrays]
-        self._library.slipid_many(ctypes.c_int32(count), *pointers)
+        self.library.slipid_many(ctypes.c_int32(count), *pointers)
         return said, command
 
     def _call(self, name: str, *arguments: np.ndarray | float) -> None:
@@ -149,7 +154,7 @@ class CompiledC:
             for a in arguments
         ]
         suffix = "_float" if self._number is ctypes.c_float else ""
-        getattr(self._library, f"slipid_{name}{suffix}")(*given)
+        getattr(self.library, f"slipid_{name}{suffix}")(*given)
 
 
 def put(record: np.ndarray, tree: object) -> None:

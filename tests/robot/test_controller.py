@@ -21,10 +21,7 @@ from slipid.robot.supervision import OFF_S, PROBE_S
 from slipid.search_space import Choice, Space
 from tests.helpers.kinds import FLOORS, SHAPES, numbers
 from tests.helpers.known_robot import deploy_known
-
-DT = 0.05
-ASKED = np.array([0.2, 0.0, 0.2])
-"""Demanded twist [m/s, m/s, rad/s]."""
+from tests.helpers.motors_cut import ASKED, CUT, DT, patterns
 
 
 @pytest.fixture(scope="module", params=list(SHAPES))
@@ -57,19 +54,8 @@ def cut(robot, dead):
     return jax.lax.scan(step, begin, dead)[1]
 
 
-def patterns() -> np.ndarray:
-    """Times at which motors are cut: once for 1 to 60 s, or ten times at random."""
-    rng, steps = np.random.default_rng(0), 1500
-    since = np.arange(steps) - 100
-    rows = [(since >= 0) & (since < seconds / DT) for seconds in (1, 3, 12, 20, 60)]
-    for _ in range(10):
-        times = np.cumsum(rng.uniform(0.1, 6.0, 40)) / DT
-        rows.append(np.searchsorted(times, np.arange(steps)) % 2 == 1)
-    return np.array(rows)
-
-
 def test_a_robot_whose_motors_were_cut_drives_on_with_a_ramp(robot):
-    dead = patterns()
+    dead = patterns() == CUT
     twist, command, off, gave_up, tried = (
         np.asarray(x) for x in jax.vmap(cut, (None, 0))(robot, jnp.asarray(dead))
     )
@@ -111,6 +97,23 @@ def test_the_velocity_mode_compensates_slip_on_every_floor(truth, robot):
         assert with_slip.max() < 0.01
         if without.max() > 0.01:
             assert with_slip.max() < 0.35 * without.max()
+
+
+def test_no_single_wheel_speeds_up_on_a_floor_that_is_believed_under_it_alone(robot):
+    """Its slip comes from the drag at all wheels, so that the others' floors count as much."""
+    controller, twist = Controller(robot, Gains()), jnp.asarray(ASKED)
+    nothing = replace(Readings.nothing(robot.drives), wheel_angle=jnp.zeros(robot.drives))
+    estimator = Odometry(robot)
+    _, estimate = estimator.advance(estimator.init(), nothing, jnp.asarray(DT))
+
+    def wheels(soft):
+        belief = np.zeros((robot.wheels, 3))
+        belief[:, 0], belief[soft] = 1.0, (0.0, 1.0, 0.0)
+        believed = replace(estimate, surface_probability=jnp.asarray(belief))
+        return np.asarray(controller._wheel_speeds(twist, believed, jnp.zeros((), bool)))
+
+    np.testing.assert_allclose(wheels(0), wheels(robot.wheels - 1), atol=1e-12)
+    assert np.abs(wheels(0) - wheels(slice(None))).max() > 1e-3
 
 
 def test_a_robot_that_cannot_go_sideways_reaches_its_reference(truth):
