@@ -317,13 +317,16 @@ class Controller(eqx.Module):
         """Return the wheel speeds that move the body with a twist on the floors believed [rad/s].
 
         The matrices of the floors are averaged over the belief under all wheels: how much a wheel
-        slips depends on its own floor and on the drag that the floors of the others cause. On an
-        unknown floor the wheels are assumed to roll without slip. So are those of a robot that can
-        drive sideways and pursues a reference: its pose loop corrects slip by itself, and
+        slips depends on its own floor and on the drag that the floors of the others cause. An
+        unknown floor is taken for the known floors in proportion to their probabilities; without
+        any belief in them, wheels are assumed to roll without slip. So are those of a robot that
+        can drive sideways and pursues a reference: its pose loop corrects slip by itself, and
         compensation by a belief about floors that may be wrong does not bring it nearer.
         """
         f = self.robot
         under = jnp.mean(e.surface_probability[:, :-1], axis=0)
+        known = jnp.sum(under)
+        under = jnp.where(known > 1e-9, under / jnp.maximum(known, 1e-9), 0.0)
         if f.holonomic:
             under = jnp.where(pursues, 0.0, under)
         slipping = jnp.sum(under[:, None] * (f.inverse_kinematics @ twist), axis=0)

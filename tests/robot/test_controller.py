@@ -183,3 +183,15 @@ def test_a_robot_that_steers_has_no_controller(robot):
     steering = Steering(*jnp.zeros((5, len(robot.labels))))
     with pytest.raises(ValueError, match=r"steered wheels.* expected omni, mecanum, differential"):
         Controller(replace(robot, steering=steering), Gains())
+
+
+def test_an_unknown_floor_is_taken_for_the_known_ones(robot):
+    controller = Controller(robot, Gains())
+    _, nothing = Odometry(robot).step(Odometry(robot).init(), Readings.nothing(robot.drives), DT)
+    probability = jnp.zeros((robot.wheels, 3)).at[:].set(jnp.array([0.01, 0.0, 0.99]))
+    on_first = replace(nothing, surface_probability=probability)
+    asked, no = jnp.asarray(ASKED), jnp.zeros((), bool)
+    found = controller._wheel_speeds(asked, on_first, no)
+    np.testing.assert_allclose(found, robot.inverse_kinematics[0] @ asked, rtol=1e-9)
+    rolling = robot.forward @ asked / robot.frame.radius
+    np.testing.assert_allclose(controller._wheel_speeds(asked, nothing, no), rolling, rtol=1e-9)
