@@ -66,8 +66,11 @@ def loop_step(
         dt: time since the last step [s].
     """
     estimator, estimate = loop.estimator.step(state[0], z, dt)
-    controller, asked = loop.controller.asked(state[1], reference, estimate, dt)
-    twist = jnp.where(jnp.all(jnp.isnan(twist)), asked, twist)
+    pursuing, asked = loop.controller.asked(state[1], reference, estimate, dt)
+    pursues = jnp.all(jnp.isnan(twist))
+    # without a reference to follow, the state is as if `asked` had not been called
+    controller = jax.tree.map(lambda *of: jnp.where(pursues, *of), pursuing, state[1])
+    twist = jnp.where(pursues, asked, twist)
     controller, command = loop.controller.drive(controller, twist, estimate, dt)
     return (estimator, controller), estimate, command
 
