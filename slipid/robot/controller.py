@@ -50,7 +50,8 @@ from slipid.robot.trajectory import Path
 
 NO_CONTROLLER = (
     "this robot turns by steered wheels: it has an estimator (slipid.Estimator), but no "
-    "controller; expected omni, mecanum, differential or skid-steer drives"
+    "controller, so `slipid trial` and `slipid export` are not available; expected omni, mecanum, "
+    "differential or skid-steer drives"
 )
 """Message for robots that have no controller, see `DeployedRobot.has_controller`."""
 Correction = Literal["none", "torque", "paper_print", "paper_code"]

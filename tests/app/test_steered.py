@@ -201,7 +201,7 @@ def test_its_estimator_steers(car, tmp_path):
     done = invoke("export", out / "robot.json", "--out", tmp_path / "exported")
     assert done.exit_code == 2
     assert "`slipid export` are not available" in done.stderr
-    assert "(of a robot with steered wheels, identify alone)" in done.stderr
+    assert "expected omni, mecanum, differential or skid-steer drives" in done.stderr
     with pytest.raises(ValueError, match="no hypothetical floors for a robot that steers"):
         robot.with_unseen()
 
