@@ -1,8 +1,8 @@
 """Paths over time: reference poses and rates, whose time stops while the robot lags behind.
 
 A robot whose wheels determine x, y and yaw drives along its path without turning. The heading of
-any other robot is tangent to the path, which consists of sections: on a `Section` the curvature k
-[1/m] changes linearly with the driven distance s [m], so that it is a line, an arc or a clothoid,
+any other robot is tangent to the path, which consists of sections: on a `PathSection` the curvature
+k [1/m] changes linearly with the driven distance s [m], so that it is a line, an arc or a clothoid,
 and on a `Turn` the robot turns on the spot:
 
     d heading / ds = k(s),   d (x, y) / ds = (cos heading, sin heading)
@@ -177,7 +177,7 @@ def rectangle(
     return waypoints(corners, speed, turn=turn)
 
 
-class Section(NamedTuple):
+class PathSection(NamedTuple):
     """Part of a path whose curvature changes linearly with the distance: line, arc or clothoid.
 
     Attributes:
@@ -196,14 +196,14 @@ class Turn(NamedTuple):
     angle: float
 
 
-Shape = Sequence[Section | Turn]
+Shape = Sequence[PathSection | Turn]
 """Sections of a path in the order in which they are driven."""
 
 
-def arc(radius: float, angle: float) -> Section:
+def arc(radius: float, angle: float) -> PathSection:
     """Return an arc of a `radius` [m] and an `angle` [rad], positive to the left."""
     bend = float(np.sign(angle)) / radius
-    return Section(abs(angle) * radius, bend, bend)
+    return PathSection(abs(angle) * radius, bend, bend)
 
 
 def rectangle_shape(length: float = 0.9, width: float = 0.4, radius: float = 0.0) -> Shape:
@@ -222,7 +222,7 @@ def rectangle_shape(length: float = 0.9, width: float = 0.4, radius: float = 0.0
             f"arcs of radius {radius} m in a rectangle of {length} x {width} m; expected a radius "
             f"below {0.5 * min(length, width):g} m"
         )
-    return [part for side in 2 * sides for part in (Section(side), corner)]
+    return [part for side in 2 * sides for part in (PathSection(side), corner)]
 
 
 def clothoid_shape(radius: float = 0.2, side: float = 0.1) -> Shape:
@@ -232,7 +232,11 @@ def clothoid_shape(radius: float = 0.2, side: float = 0.1) -> Shape:
     to that of the `radius` [m] and falls again.
     """
     half = 0.5 * np.pi * radius
-    return 4 * [Section(side), Section(half, 0.0, -1 / radius), Section(half, -1 / radius, 0.0)]
+    return 4 * [
+        PathSection(side),
+        PathSection(half, 0.0, -1 / radius),
+        PathSection(half, -1 / radius, 0.0),
+    ]
 
 
 def tangent(
@@ -268,7 +272,7 @@ def tangent(
         raise ValueError(f"sections {list(shape)}; expected one or more, each longer than 0")
     rows, stops = np.zeros((1, 6)), list[int]()
     for (moves, ahead), alike in itertools.groupby(
-        shape, lambda part: (isinstance(part, Section), part[0] > 0)
+        shape, lambda part: (isinstance(part, PathSection), part[0] > 0)
     ):
         parts = list(alike)
         size, sign = np.abs([part[0] for part in parts]), 1.0 if ahead else -1.0

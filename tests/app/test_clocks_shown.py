@@ -24,7 +24,12 @@ CLOCK = Clock(
 
 def shown(*clocks: Clock) -> str:
     names = ("findings", "groups", "channels", "messages")
-    content = {name: [] for name in names} | {"notes": {}, "parameters": {}, "derived": {}}
+    content = {name: [] for name in names} | {
+        "notes": {},
+        "parameters": {},
+        "derived": {},
+        "settings": {},
+    }
     page = Page(kept=True)
     show_check(page, content | {"clocks": {f"run{k}": _clock(c) for k, c in enumerate(clocks)}})
     return " ".join(page.text.split())

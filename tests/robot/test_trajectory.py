@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from slipid.robot import trajectory
-from slipid.robot.trajectory import SHAPES, Section, Turn, tangent
+from slipid.robot.trajectory import SHAPES, PathSection, Turn, tangent
 
 
 def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
@@ -105,7 +105,7 @@ def test_a_path_waits_for_a_robot_that_lags_and_not_for_one_that_is_ahead():
 
 
 def test_a_path_waits_for_a_heading_that_lags_and_not_for_one_that_is_ahead():
-    path = tangent([Turn(-3.0), Section(1.0)], pause=0.0)
+    path = tangent([Turn(-3.0), PathSection(1.0)], pause=0.0)
     now = jnp.asarray(1.0)  # it turns to the right
     here = np.asarray(path.at(1.0))[:3]
 
@@ -131,7 +131,7 @@ def test_a_path_waits_for_a_heading_that_lags_and_not_for_one_that_is_ahead():
 
 
 def test_a_path_waits_for_a_lag_and_not_for_a_tolerated_distance_to_the_side():
-    path = tangent([Section(1.0)], pause=0.0)
+    path = tangent([PathSection(1.0)], pause=0.0)
     now = jnp.asarray(2.0)
     here = np.asarray(path.at(now))[:3]
 
@@ -160,12 +160,12 @@ def test_paths_are_refused_with_the_reason():
     with pytest.raises(ValueError, match="expected positive numbers"):
         trajectory.rectangle(speed=-0.2)
     with pytest.raises(ValueError, match="expected positive numbers"):
-        tangent([Section(1.0)], speed=0.0)
+        tangent([PathSection(1.0)], speed=0.0)
     with pytest.raises(ValueError, match=r"yaw rate -1.0 rad/s; expected a positive number"):
         tangent([Turn(1.0)], yaw_rate=-1.0)
     with pytest.raises(ValueError, match=r"0\.9 x 0\.4 m; expected a radius below 0\.2 m"):
         trajectory.rectangle_shape(radius=0.2)
-    for shape in ([], [Section(1.0), Turn(0.0)]):
+    for shape in ([], [PathSection(1.0), Turn(0.0)]):
         with pytest.raises(ValueError, match="expected one or more, each longer than 0"):
             tangent(shape)
     with pytest.raises(ValueError, match="twice in succession"):
@@ -176,7 +176,7 @@ CLOSED = {
     **{name: shape(1.0) for name, shape in SHAPES.items()},
     "twice as large": SHAPES["eight"](2.0),
     "with arcs": trajectory.rectangle_shape(radius=0.15),
-    "in reverse": [Section(0.5, 0.0, 2.0), Section(-0.5, 2.0, 0.0)],
+    "in reverse": [PathSection(0.5, 0.0, 2.0), PathSection(-0.5, 2.0, 0.0)],
     "on the spot": [Turn(1.5), Turn(-3.0), Turn(1.5)],
 }
 """Shapes that end where they begin."""
@@ -223,7 +223,7 @@ def test_a_tangent_path_keeps_its_limits_and_uses_them(name, yaw_rate):
 
 def test_a_clothoid_has_a_curvature_that_grows_with_the_distance():
     length, bend = 0.8, 2.5
-    rows = np.asarray(tangent([Section(length, 0.0, bend)]).rows)
+    rows = np.asarray(tangent([PathSection(length, 0.0, bend)]).rows)
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows[:, :2], axis=0).T)))
     np.testing.assert_allclose(rows[:, 2], 0.5 * bend / length * driven**2, atol=1e-5)
     special = pytest.importorskip("scipy.special")
