@@ -39,7 +39,7 @@ class ControllerRow:
         tuned: True to use the gains of `Gains.of`, designed or tuned; False for gains set by hand.
         gyro: True if the robot has a gyro.
         mapped: True if the estimator uses a map of the site's floors.
-        fixed: True if the robot is told its true pose.
+        true_pose: True if the estimator receives the true pose as a pose fix in every period.
     """
 
     observer: str
@@ -49,12 +49,12 @@ class ControllerRow:
     tuned: bool = False
     gyro: bool = False
     mapped: bool = False
-    fixed: bool = False
+    true_pose: bool = False
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What the row needs besides encoders and ammeters: "gyro", "map", "true pose"."""
-        parts = {"gyro": self.gyro, "map": self.mapped, "true pose": self.fixed}
+        """Names of what the row needs besides encoders and ammeters: gyro, map, true pose."""
+        parts = {"gyro": self.gyro, "map": self.mapped, "true pose": self.true_pose}
         return tuple(name for name, needed in parts.items() if needed)
 
     def obstacle(self, robot: DeployedRobot) -> str:

@@ -133,7 +133,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         by_floor, by_pose = FloorFilter(f, s, steering), PoseFilter(f, s)
         of = by_floor.predict(old.floors, w)
         gap = by_pose.gyro_gap(old.place, z.gyro, *by_floor.yaw_rate(old.floors, of, tick), tick)
-        heard, checked = check_gyro(old.gyro, z.gyro, *gap, s.gyro_std, dt)
+        checking, checked = check_gyro(old.gyro, z.gyro, *gap, s.gyro_std, dt)
         gyro, before = checked.rate, by_pose.turned(old.place, checked.turn, checked.doubt)
         bias = before.nuisance[-1]
         turn = gyro - bias
@@ -154,7 +154,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
             wheels=wheels,
             current=currents.filtered,
             refused=refused,
-            gyro=set_aside(heard, checked, twist[2], bias, left[2, 2], dt),
+            gyro=set_aside(checking, checked, twist[2], bias, left[2, 2], dt),
             floors=floors,
             place=place,
             stuck=stuck,
@@ -173,7 +173,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
             stale=jnp.any(wheels.age > s.stale_s),
             immobilised=stuck > 0.4,
             out_of_range=self._beyond(w, currents.filtered, unknown),
-            rejected=jnp.stack([heard.rejected, wheels.rejected, refused, place.fixes.rejected]),
+            rejected=jnp.stack([checking.rejected, wheels.rejected, refused, place.fixes.rejected]),
             labels=f.labels,
         )
 

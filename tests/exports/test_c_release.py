@@ -19,7 +19,7 @@ from slipid.search_space import Choice, Space
 from tests.helpers.compiled_c import NEEDS_COMPILER, CompiledC
 from tests.helpers.kinds import FLOORS, SHAPES, numbers
 from tests.helpers.known_robot import deploy_known
-from tests.helpers.motors_cut import ASKED, CUT, HELD, STALLED, Driven, judge, patterns
+from tests.helpers.motors_cut import ASKED, CUT, HELD, STALLED, Driven, faults, patterns
 
 pytestmark = [NEEDS_COMPILER, pytest.mark.slow]
 
@@ -117,4 +117,5 @@ def test_a_robot_that_was_cut_or_held_drives_on_gently(compiled, with_reference)
     radius = float(robot.frame.radius)
     limit = float(compiled.code.loop.controller.limits.acceleration)
     for pattern in patterns((CUT, HELD, STALLED)):
-        judge(driven(compiled, pattern, with_reference), pattern, radius, limit)
+        run = driven(compiled, pattern, with_reference)
+        assert faults(run, pattern, radius, limit) == []

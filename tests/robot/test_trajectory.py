@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import special
 
 from slipid.robot import trajectory
 from slipid.robot.trajectory import SHAPES, PathSection, Turn, tangent
@@ -226,7 +227,6 @@ def test_a_clothoid_has_a_curvature_that_grows_with_the_distance():
     rows = np.asarray(tangent([PathSection(length, 0.0, bend)]).rows)
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows[:, :2], axis=0).T)))
     np.testing.assert_allclose(rows[:, 2], 0.5 * bend / length * driven**2, atol=1e-5)
-    special = pytest.importorskip("scipy.special")
     sine, cosine = special.fresnel(np.sqrt(bend * length / np.pi))
     end = np.sqrt(np.pi * length / bend) * np.array([cosine, sine])
     np.testing.assert_allclose(rows[-1, :2], end, atol=1e-12)

@@ -80,13 +80,13 @@ ROWS: Mapping[str, ControllerRow] = {
         "encoder", "law of Indiveri, whose speed limit keeps the direction", law=_indiveri
     ),
     "true_pose": ControllerRow(
-        "contact", "the controller's own limit: it is told the true pose", tuned=True, fixed=True
+        "contact", "the controller's own limit: fixes of the true pose", tuned=True, true_pose=True
     ),
 }
 """Controllers keyed by name: slipid's and the 2021 paper's, the published control laws, and the
 limit of what an estimator can achieve."""
 FIX_STD = 1e-3
-"""Std of a true pose, as it is told to the estimator [m], [rad]."""
+"""Std with which a true pose is given to the estimator [m], [rad]."""
 
 
 class TruePosePlant:
@@ -114,8 +114,8 @@ class TruePosePlant:
         return float(getattr(self._plant, "power", np.nan))
 
     def _with_pose(self, reading: Measurement | Readings) -> Measurement | Readings:
-        told = jnp.asarray(self.pose), jnp.full(2, FIX_STD), jnp.zeros(())
-        return replace(reading, fix=told[0], fix_std=told[1], fix_age=told[2])
+        std = jnp.full(2, FIX_STD)
+        return replace(reading, fix=jnp.asarray(self.pose), fix_std=std, fix_age=jnp.zeros(()))
 
 
 def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:

@@ -116,7 +116,7 @@ def verdict(runs: Sequence[TrialRun], needs: Mapping[str, Sequence[str]], has_gy
         if needs[best]:
             text += f" (with {' and '.join(SENSORS[name] for name in needs[best])}{lack})"
         if equal:
-            text += f", not told apart from {', '.join(equal)}"
+            text += f", not distinguished from {', '.join(equal)}"
         names = " and without ".join(SENSORS[name] for name in without)
         parts.append(f"without {names}: {text}" if without else f"closes best: {text}")
         if not needs[best]:

@@ -178,7 +178,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     driven = {task.name: found for task in tasks if (found := _finished_run(task)) is not None}
     runs = [run for run, _ in driven.values()]
     # the true pose is a limit, not a competitor, unless it is the only row
-    compared = [run for run in runs if not ROWS[run.controller].fixed] or runs
+    compared = [run for run in runs if not ROWS[run.controller].true_pose] or runs
     best = list(best_controllers(compared))
     needs = {name: ROWS[name].needs for name in rows}
     content = {
@@ -272,10 +272,10 @@ def drive(task: TrialTask) -> None:
         sensors = replace(task.site.sensors, gyro=row.gyro)
         site = replace(task.site, sensors=sensors)
         plant = SitePlant(site, task.floor, robot.load_setup, task.start, task.seed)
-    if row.fixed:
+    if row.true_pose:
         plant = TruePosePlant(plant)
     there = floor_of(task.known_map, robot.labels)
-    sees = row.gyro or row.fixed
+    sees = row.gyro or row.true_pose
     loop = control_loop_of(robot, row, task.settings, task.forced, there, recovery=sees)
     driven = closed_loop.run_closed_loop(loop, path, plant, task.start)
     off = driven.pose[-1] - driven.estimated_pose[-1]

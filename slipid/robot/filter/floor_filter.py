@@ -116,7 +116,7 @@ class BodyMotion(eqx.Module):
 
 
 class Prediction(eqx.Module):
-    """What every hypothesis predicts at the wheel speeds of a step.
+    """Predictions of every hypothesis at the wheel speeds of a step.
 
     Attributes:
         wheel_speed: wheel speed of every drive [rad/s].
@@ -176,7 +176,7 @@ class FloorFilter(eqx.Module):
         return weight / jnp.sum(weight)
 
     def predict(self, old: FloorState, w: Float[Array, " drive"]) -> Prediction:
-        """Return what every hypothesis predicts at the wheel speeds `w` [rad/s]."""
+        """Return the predictions of every hypothesis at the wheel speeds `w` [rad/s]."""
         settled, amps = self.solve(old.twist, w)
         f, hypotheses = self.robot, hypotheses_of(self.robot)
         rolling = f.inverse @ (f.frame.radius * w)
@@ -221,7 +221,7 @@ class FloorFilter(eqx.Module):
 
         Args:
             old: belief before the step.
-            of: what the hypotheses predict in this step.
+            of: predictions of the hypotheses in this step.
             currents: motor currents.
             turn: gyro's yaw rate less its bias; NaN without a gyro [rad/s].
             tick: the time step.

@@ -170,10 +170,10 @@ def read_wheels(
     # an encoder that repeats its angle may be late, until it counts as at rest
     late = by_angle & fits & (total == 0.0) & (since <= LONGEST_LATE_S) & (old.rate != 0.0)
 
-    told = jnp.where(jnp.isfinite(z.wheel_speed), z.wheel_speed, 0.0)
+    given = jnp.where(jnp.isfinite(z.wheel_speed), z.wheel_speed, 0.0)
     close = change(age) + SPEED_NOISE
-    close = (jnp.abs(told - old.rate) <= close) | (jnp.abs(told - old.aside) <= close)
-    by_speed = jnp.isfinite(z.wheel_speed) & ~by_angle & (jnp.abs(told) < most)
+    close = (jnp.abs(given - old.rate) <= close) | (jnp.abs(given - old.aside) <= close)
+    by_speed = jnp.isfinite(z.wheel_speed) & ~by_angle & (jnp.abs(given) < most)
     by_speed &= close | (old.age > stale_s)
     lost = timed & jnp.isfinite(z.wheel_speed) & ~(accepted | by_speed)
     beyond = timed & jnp.isfinite(z.wheel_angle) & ~known
@@ -185,7 +185,7 @@ def read_wheels(
     usual = jnp.where(again, raw, old.rate + (1 - jnp.exp(-dt / RATE_S)) * (mean - old.rate))
     rest = compared & (total == 0.0) & (since > LONGEST_LATE_S)
     usual = jnp.where(rest, 0.0, jnp.clip(usual, -most, most))
-    rate = jnp.where(by_angle & ~late, usual, jnp.where(by_speed, told, old.rate))
+    rate = jnp.where(by_angle & ~late, usual, jnp.where(by_speed, given, old.rate))
     coast = jnp.where(age > stale_s, 0.0, rate)
     fastest = jnp.clip(turned / jnp.maximum(dt, 1e-4), -most, most)
     speed = jnp.where(by_angle, fastest, coast)
@@ -197,7 +197,7 @@ def read_wheels(
     ahead, other_ahead = old.ahead + speed * dt, old.other_ahead + speed * dt
     # what exceeds the largest speed is accounted for in the next steps
     left = jnp.where(by_angle, speed * dt - turned, 0.0)
-    asides = jnp.where(aside, raw, jnp.where(lost, told, old.aside))
+    asides = jnp.where(aside, raw, jnp.where(lost, given, old.aside))
     believed = (accepted | by_speed) & ~aside
     return WheelState(
         speed=speed,

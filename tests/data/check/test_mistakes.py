@@ -31,7 +31,7 @@ def alarms(runs, geometry):
 
 
 def wrongly_named(mistake, robot):
-    """What is wrong with the alarms that a mistake raises; empty if they are right."""
+    """Faults of the alarms that a mistake raises; empty if they are right."""
     found, wrong = alarms(*mistake.made(driven(robot), robot)), []
     if {f.kind for f in found} != set(mistake.kinds):
         wrong.append(f"found {sorted(f.kind for f in found)}, expected {sorted(mistake.kinds)}")
