@@ -40,12 +40,7 @@ from slipid.robot.gains import Gains
 from slipid.robot.interface import UNTIMED_S, StateEstimate, as_arrays
 from slipid.robot.limits import Limits
 from slipid.robot.record import ActuatorRecord
-from slipid.robot.supervision import (
-    PROBE_S,
-    ControllerState,
-    recovery_factors,
-    supervised,
-)
+from slipid.robot.supervision import PROBE_S, ControllerState, Supervisor, recovery_factors
 from slipid.robot.trajectory import Path
 
 NO_CONTROLLER = (
@@ -272,16 +267,8 @@ class Controller(eqx.Module):
             wheel_speed=jnp.where(usable, e.wheel_speed, 0.0),
         )
         probe = PROBE_S * self.limits.acceleration / f.frame.radius
-        new = supervised(
-            old,
-            asked,
-            now,
-            jnp.where(usable, dt, 0.0),
-            recovery=self.recovery,
-            highest_speed=self.limits.speed,
-            probe=probe,
-            response=self.response,
-        )
+        supervisor = Supervisor(self.recovery, self.limits.speed, probe, self.response)
+        new = supervisor.step(old, asked, now, jnp.where(usable, dt, 0.0))
         moves = usable & ~new.gave_up
         wanted = self._limited_twist(asked * recovery_factors(old.tried))
         # low-pass filter the disturbance: the estimated twist less the last step's demanded twist

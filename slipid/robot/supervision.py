@@ -101,63 +101,66 @@ class ControllerState(eqx.Module):
         return replace(self, still=zero, tried=zero, gave_up=jnp.zeros((), bool))
 
 
-def supervised(
-    old: ControllerState,
-    asked: Float[Array, "3"],
-    e: StateEstimate,
-    dt: Float[Array, ""],
-    *,
-    recovery: Bool[Array, ""],
-    highest_speed: Scalar,
-    probe: Float[Array, ""],
-    response: Float[Array, ""],
-) -> ControllerState:
-    """Return the state with its supervision one time step later.
+class Supervisor(eqx.Module):
+    """Supervision of a robot's drives and motion.
 
-    While a robot in recovery turns on the spot no translation is demanded, so `still` does not
-    change during that phase.
-
-    Args:
-        old: state after the last step.
-        asked: twist that is demanded before any recovery [m/s, m/s, rad/s].
-        e: present estimate, without NaN.
-        dt: time step; 0 while the estimate cannot be used [s].
+    Attributes:
         recovery: True if the robot may try to free itself.
         highest_speed: highest speed that is demanded of the body [m/s].
         probe: wheel speed that is commanded to drives that are off [rad/s].
         response: delay and lag with which the wheels follow their commands [s].
     """
-    quick, slow = (1 - jnp.exp(-dt / (FOLLOW_FILTER_S + late)) for late in (0.0, response))
-    turned = old.turned + quick * (e.wheel_speed - old.turned)
-    expected = old.expected + slow * (old.command - old.expected)
-    size = jnp.abs(expected)
-    lost = (size > 0.5 * probe) & (turned * jnp.sign(expected) < FOLLOW_SHARE * size)
-    unfollowed = jnp.clip(old.unfollowed + jnp.where(jnp.any(lost), dt, -dt), 0.0, OFF_S)
-    drives_off = unfollowed > jnp.where(old.drives_off, OFF_S - ON_S, OFF_S - 1e-6)
 
-    demand, speed = (jnp.sqrt(x[:2] @ x[:2] + 1e-12) for x in (old.wanted, e.twist))
-    blocked = (demand > STUCK_SHARE * highest_speed) & (speed < STUCK_SHARE * demand)
-    since = jnp.where(spins(old.tried), 0.0, jnp.where(e.immobilised | blocked, dt, -dt))
-    still = jnp.clip(old.still + since, 0.0, 2 * STUCK_S)
-    tries = recovery & (still > STUCK_S)
-    still = jnp.where(tries & (old.tried == 0), 2 * STUCK_S, still)
-    tried = jnp.where(tries, old.tried + dt, 0.0)
+    recovery: Bool[Array, ""]
+    highest_speed: Scalar
+    probe: Scalar
+    response: Scalar
 
-    rests = (jnp.sqrt(asked[:2] @ asked[:2]) < REST_SPEED) & (jnp.abs(asked[2]) < REST_YAW_RATE)
-    resting = jnp.where(rests, jnp.minimum(old.resting + dt, REARM_S), 0.0)
-    # reset what was integrated while the drives were off, or once nothing was demanded for a while
-    reset = drives_off | (resting >= REARM_S)
-    return replace(
-        old,
-        still=jnp.where(reset, 0.0, still),
-        tried=jnp.where(reset, 0.0, jnp.where(old.gave_up, old.tried, tried)),
-        expected=expected,
-        turned=turned,
-        unfollowed=unfollowed,
-        resting=resting,
-        drives_off=drives_off,
-        gave_up=~reset & (old.gave_up | (tried > RECOVERY_LIMIT_S)),
-    )
+    def step(
+        self, old: ControllerState, asked: Float[Array, "3"], e: StateEstimate, dt: Array
+    ) -> ControllerState:
+        """Return the state with its supervision one time step later.
+
+        While a robot in recovery turns on the spot no translation is demanded, so `still` does not
+        change during that phase.
+
+        Args:
+            old: state after the last step.
+            asked: twist that is demanded before any recovery [m/s, m/s, rad/s].
+            e: present estimate, without NaN.
+            dt: time step; 0 while the estimate cannot be used [s].
+        """
+        quick, slow = (1 - jnp.exp(-dt / (FOLLOW_FILTER_S + late)) for late in (0, self.response))
+        turned = old.turned + quick * (e.wheel_speed - old.turned)
+        expected = old.expected + slow * (old.command - old.expected)
+        size = jnp.abs(expected)
+        lost = (size > 0.5 * self.probe) & (turned * jnp.sign(expected) < FOLLOW_SHARE * size)
+        unfollowed = jnp.clip(old.unfollowed + jnp.where(jnp.any(lost), dt, -dt), 0.0, OFF_S)
+        drives_off = unfollowed > jnp.where(old.drives_off, OFF_S - ON_S, OFF_S - 1e-6)
+
+        demand, speed = (jnp.sqrt(x[:2] @ x[:2] + 1e-12) for x in (old.wanted, e.twist))
+        blocked = (demand > STUCK_SHARE * self.highest_speed) & (speed < STUCK_SHARE * demand)
+        since = jnp.where(spins(old.tried), 0.0, jnp.where(e.immobilised | blocked, dt, -dt))
+        still = jnp.clip(old.still + since, 0.0, 2 * STUCK_S)
+        tries = self.recovery & (still > STUCK_S)
+        still = jnp.where(tries & (old.tried == 0), 2 * STUCK_S, still)
+        tried = jnp.where(tries, old.tried + dt, 0.0)
+
+        rests = (jnp.sqrt(asked[:2] @ asked[:2]) < REST_SPEED) & (jnp.abs(asked[2]) < REST_YAW_RATE)
+        resting = jnp.where(rests, jnp.minimum(old.resting + dt, REARM_S), 0.0)
+        # reset what was integrated while drives were off, or once nothing was demanded for a while
+        reset = drives_off | (resting >= REARM_S)
+        return replace(
+            old,
+            still=jnp.where(reset, 0.0, still),
+            tried=jnp.where(reset, 0.0, jnp.where(old.gave_up, old.tried, tried)),
+            expected=expected,
+            turned=turned,
+            unfollowed=unfollowed,
+            resting=resting,
+            drives_off=drives_off,
+            gave_up=~reset & (old.gave_up | (tried > RECOVERY_LIMIT_S)),
+        )
 
 
 def spins(tried: Float[Array, ""]) -> Bool[Array, ""]:
