@@ -100,7 +100,7 @@ def drive(
     row, begin = ROWS[controller], places[start]
     plant: closed_loop.Plant
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
-    if row.fixed:
+    if row.true_pose:
         plant = TruePosePlant(plant)
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
     driven = closed_loop.run_closed_loop(

@@ -13,7 +13,6 @@ from slipid.cli.common import (
     Quiet,
     emit,
     executor_of,
-    flag,
     for_robots,
     option,
 )
@@ -54,18 +53,13 @@ def trial(
     speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Number of start poses.")] = 20,
     load: Load = None,
-    tuned_gains: Annotated[
-        bool,
-        flag("--tuned-gains", "Use tuned gains even if they are no better than those set by hand."),
-    ] = False,
     jobs: Jobs = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
     """Drive a simulated robot along a path with every controller, and compare their errors.
 
-    Gains are designed if robot.json has delay and lag of the wheels, else set by hand; the tuned
-    gains of an older robot.json are used if they are better than those set by hand.
+    Gains are designed if robot.json has delay and lag of the wheels, else set by hand.
     Writes trial.json and trial.png to OUT. Finished runs are kept and not simulated again.
     """
     from slipid.lab.trial.plots import trial_plot
@@ -83,7 +77,6 @@ def trial(
         speed=speed,
         starts=starts,
         load=load,
-        tuned_gains=tuned_gains,
     )
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
         done = run(out, options, executor, report)

@@ -36,7 +36,7 @@ class ControllerRow:
         correction: torque correction of the 2021 paper, see `slipid.robot.controller.Controller`.
         law: function from a robot to a published control law that replaces the pose loop; None for
             the pose loop.
-        tuned: True to use the gains of `Gains.of`, designed or tuned; False for gains set by hand.
+        designed: True to use the gains of `Gains.of`; False for gains set by hand.
         gyro: True if the robot has a gyro.
         mapped: True if the estimator uses a map of the site's floors.
         true_pose: True if the estimator receives the true pose as a pose fix in every period.
@@ -46,7 +46,7 @@ class ControllerRow:
     about: str
     correction: Correction = "none"
     law: Callable[[DeployedRobot], Law] | None = None
-    tuned: bool = False
+    designed: bool = False
     gyro: bool = False
     mapped: bool = False
     true_pose: bool = False
@@ -77,7 +77,7 @@ CONTROLLERS: Mapping[str, ControllerRow] = {
     "calibrated": ControllerRow(
         "calibrated",
         "odometry from encoders with calibrated lengths (effective track and radius)",
-        tuned=True,
+        designed=True,
     ),
     "slip_odometry": ControllerRow("curve", "odometry corrected by slip over current (figure 5)"),
     "paper_print": ControllerRow(
@@ -90,14 +90,14 @@ CONTROLLERS: Mapping[str, ControllerRow] = {
         "curve", "slip odometry and the torque correction without its two errors", "torque"
     ),
     "contact": ControllerRow(
-        "contact", "contact estimator, gains designed if delay and lag are known", tuned=True
+        "contact", "contact estimator, gains designed if delay and lag are known", designed=True
     ),
     "contact_hand": ControllerRow("contact", "contact estimator, gains set by hand"),
     "contact_map": ControllerRow(
-        "contact", "contact estimator with a map of the floors", tuned=True, mapped=True
+        "contact", "contact estimator with a map of the floors", designed=True, mapped=True
     ),
     "contact_gyro": ControllerRow(
-        "contact", "contact estimator with a gyro", tuned=True, gyro=True
+        "contact", "contact estimator with a gyro", designed=True, gyro=True
     ),
 }
 """Combinations of estimator and controller, keyed by the name that users give."""
@@ -107,14 +107,13 @@ def control_loop_of(
     robot: DeployedRobot,
     row: ControllerRow,
     settings: Settings | None = None,
-    forced: bool = False,
     floor: Floor | None = None,
     recovery: bool | None = None,
 ) -> ControlLoop[eqx.Module]:
     """Return the control loop of a row for a robot.
 
-    The gains are those of `Gains.of` if `row.tuned` is True, else those set by hand; `forced` is
-    True to use tuned gains even if they are no better. `floor` is used if `row.mapped` is True.
+    The gains are those of `Gains.of` if `row.designed` is True, else those set by hand. `floor` is
+    used if `row.mapped` is True.
     `recovery` is True if a stuck robot may try to free itself; None if the row has a gyro or the
     robot's logs have one.
 
@@ -127,7 +126,7 @@ def control_loop_of(
         robot = _rolling_by(robot, np.array(robot.record.nominal))
     if row.observer == "calibrated":
         robot = _rolling_by(robot, np.mean(_calibrations(robot), axis=0))
-    gains = Gains.of(robot, forced) if row.tuned else Gains()
+    gains = Gains.of(robot) if row.designed else Gains()
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")

@@ -3,7 +3,6 @@
 import glob
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -282,13 +281,7 @@ def _settings(given: Mapping[str, tuple[float, str]]) -> dict[str, Setting]:
 
 def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
     """Write robot.json into the folder of a fit; return the names of the written files."""
-    robot, path = deploy(found), out / ROBOT
-    # keep tuned gains of an existing readable file if the robot's parameters are unchanged
-    with suppress(DataError):
-        before = DeployedRobot.load(path).record if path.is_file() else robot.record
-        if before.numbers == robot.record.numbers:
-            robot = DeployedRobot.of(replace(robot.record, gains=before.gains))
-    robot.save(path)
+    deploy(found).save(out / ROBOT)
     return (ROBOT,)
 
 

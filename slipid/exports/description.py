@@ -158,21 +158,9 @@ def gains_origin(robot: DeployedRobot) -> str:
 
 def gains_sentence(robot: DeployedRobot) -> str:
     """Return a sentence about the origin of a robot's gains, with the margins of designed ones."""
-    tuned, found = robot.record.gains, DesignedGains.of(robot)
-    if tuned is not None and tuned.load == robot.load_setup and tuned.is_better:
-        loss = f"loss {tuned.loss.tuned:.1f} mm, by hand {tuned.loss.hand:.1f} mm"
-        gyro = "with a gyro" if tuned.gyro else "without a gyro"
-        return (
-            f"Gains tuned on the twin {gyro}, better than the gains set by hand in simulated runs "
-            f"({loss})."
-        )
-    why = ""
-    if tuned is not None and tuned.load != robot.load_setup:
-        why = f"; the tuned gains are for the load set-up {one_line(tuned.load)}"
-    elif tuned is not None:
-        why = f"; the tuned gains are {tuned.verdict}"
+    found = DesignedGains.of(robot)
     if found is None:
-        return f"Gains set by hand, since delay and lag of the wheels are unknown{why}."
+        return "Gains set by hand, since delay and lag of the wheels are unknown."
     loops = listed(
         [
             f"{name} loop with a phase margin of {one.margin_deg:.0f} deg and a bandwidth of "
@@ -183,7 +171,7 @@ def gains_sentence(robot: DeployedRobot) -> str:
     a = found.actuator
     return (
         f"Gains designed for wheels with a delay of {a.delay_s:.2g} s and a lag of "
-        f"{a.lag_s:.2g} s: {loops}{why}."
+        f"{a.lag_s:.2g} s: {loops}."
     )
 
 
@@ -317,19 +305,12 @@ def _table_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
 
 
 def _gain_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
-    gains, tuned = Gains.of(robot), robot.record.gains
-    taken = tuned is not None and tuned.is_better and tuned.load == robot.load_setup
-    designed = DesignedGains.of(robot)
+    gains, designed = Gains.of(robot), DesignedGains.of(robot)
     sure = ("by hand", "default") if designed is None else ("designed", "from delay and lag")
-    if taken:
-        sure = ("tuned, better than set by hand", "robot.json")
     for e in used_gains(robot):
         d = e.declaration
-        # gains that a robot was not tuned for have their values set by hand
-        one = getattr(tuned.values, e.path, None) if tuned is not None and taken else None
-        doc = f"{d.doc}; std at the end of the search {short(one.spread)}" if one else d.doc
         about = (d.symbol, float(e.get(gains)), d.unit, None)
-        yield NumberRow("gains", f"gains.{e.path}", "", *about, *sure, doc)
+        yield NumberRow("gains", f"gains.{e.path}", "", *about, *sure, d.doc)
 
 
 def _matrix_rows(robot: DeployedRobot) -> Iterator[NumberRow]:

@@ -1,4 +1,4 @@
-"""Gains of the controller: designed for the robot's actuators, tuned, or set by hand.
+"""Gains of the controller: designed for the robot's actuators, or set by hand.
 
 Where delay and lag of the wheels are known, gains follow from them by `slipid.robot.loop_design`,
 at the phase margins `MARGIN_DEG` and `LATERAL_MARGIN_DEG`. Gains are smaller where the estimate is
@@ -10,7 +10,7 @@ the model's random errors [m/sqrt(m)] or [rad/sqrt(m)], v the limit of speed [m/
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -61,23 +61,14 @@ class Gains(eqx.Module):
         return jnp.minimum(self.lateral, self.lateral_rate**2 / (speed**2 + 1e-9))
 
     @classmethod
-    def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
-        """Return a robot's gains: tuned ones, else designed ones, else those set by hand.
-
-        Tuned gains, which files of earlier versions hold, are used for their load set-up if they
-        are better than the gains set by hand, or if `forced` is True. Designed gains need known
-        actuators.
+    def of(cls, robot: RobotArrays) -> "Gains":
+        """Return the gains designed for a robot, or those set by hand if its actuators are unknown.
 
         Raises:
             ValueError: the robot consists of arrays without a record.
         """
-        known = with_record(robot)
-        tuned = known.record.gains
-        if tuned is None or tuned.load != known.load_setup or not (tuned.is_better or forced):
-            found = DesignedGains.of(robot)
-            return cls() if found is None else found.gains
-        kept = {f.name for f in fields(cls)} & {f.name for f in fields(tuned.values)}
-        return cls(**{name: as_numbers(getattr(tuned.values, name).value) for name in kept})
+        found = DesignedGains.of(robot)
+        return cls() if found is None else found.gains
 
 
 def used_gains(robot: RobotArrays) -> tuple[Entry, ...]:

@@ -26,7 +26,6 @@ Verdict = Literal["identified", "weak", "disputed", "not_identified", "at_bound"
 Provenance = Literal["measured", "borrowed", "override"]
 Basis = Literal["config", "logs", "assumed"]
 """Origin of a setting: the user's config, the logs, or nothing that belongs to the robot."""
-GainsVerdict = Literal["better than by hand", "no better than by hand", "worse than by hand"]
 UNITS = {
     "wheels.place": "base radius",
     "wheels.drive_angle": "rad",
@@ -59,7 +58,6 @@ UNITS = {
     "steering.zero": "rad",
     "steering.gain": "1",
     "steering.understeer": "s^2/m",
-    "gains.loss": "mm",
     "limits.speed": "m/s",
     "limits.yaw_rate": "rad/s",
     "limits.acceleration": "m/s^2",
@@ -290,77 +288,6 @@ class ActuatorRecord:
         return self.delay_s.value + self.lag_s.value
 
 
-@dataclass(frozen=True)
-class GainRecord:
-    """Value of a tuned gain [unit], and its spread among the search's last candidates [unit]."""
-
-    value: float
-    unit: str
-    spread: float
-
-
-@dataclass(frozen=True)
-class GainValues:
-    """All gains of `slipid.robot.gains.Gains`, and the gain `ahead`, which is no longer used.
-
-    Attributes:
-        place: gain of the position loop.
-        yaw: gain of the heading loop.
-        integral: gain of the integral of the position error.
-        ahead: fraction of the wheel speeds that earlier controllers took from the contact model.
-        observer: gain of the disturbance observer.
-        preview: time by which reference rates are read ahead of the reference pose on the path.
-    """
-
-    place: GainRecord
-    yaw: GainRecord
-    integral: GainRecord
-    ahead: GainRecord
-    observer: GainRecord
-    preview: GainRecord
-
-
-@dataclass(frozen=True)
-class Losses:
-    """Losses of the gains set by hand and of the tuned gains, on cases not used for tuning.
-
-    A loss is the mean error over the cases plus the mean error over the worst tenth of the cases.
-    """
-
-    hand: float
-    tuned: float
-
-
-@dataclass(frozen=True)
-class GainsRecord:
-    """Tuned gains in a file that an earlier version wrote; this version does not tune gains.
-
-    Attributes:
-        values: the gains.
-        load: load set-up for which they were tuned.
-        gyro: True if the robot had a gyro during tuning.
-        method: method of the search.
-        loss: losses of the gains set by hand and of the tuned gains.
-        better_than_hand: fraction of the cases in which tuned gains have the smaller loss.
-        stability_margin: 1 less the largest spectral radius of the linearized loops.
-        verdict: comparison of the losses; "better" or "worse" if they differ by more than chance.
-    """
-
-    values: GainValues
-    load: str
-    gyro: bool
-    method: str
-    loss: Losses
-    better_than_hand: float
-    stability_margin: float
-    verdict: GainsVerdict
-
-    @property
-    def is_better(self) -> bool:
-        """True if the tuned gains are to be used instead of the gains set by hand."""
-        return self.verdict == "better than by hand"
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RobotRecord:
     """Content of robot.json. Two records with the same content are equal.
@@ -385,7 +312,6 @@ class RobotRecord:
         data: hash of the runs; None if the parameters were given, not fitted.
         versions: versions of the software that computed the parameters.
         draws: posterior draws of the fitted parameters, keyed by path.
-        gains: tuned gains; None if there are none.
         steering: steering of a robot that steers; None for others.
     """
 
@@ -405,13 +331,12 @@ class RobotRecord:
     data: str | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
     draws: Mapping[str, tuple[Numbers, ...]]
-    gains: GainsRecord | None = None
     steering: SteeringRecord | None = None
 
     @cached_property
     def numbers(self) -> str:
-        """Hash of the robot's parameters; it does not depend on gains, versions and messages."""
-        return checksum(asdict(replace(self, gains=None, versions={}, messages=())))
+        """Hash of the robot's parameters; it does not depend on versions and messages."""
+        return checksum(asdict(replace(self, versions={}, messages=())))
 
     @cached_property
     def _mark(self) -> str:

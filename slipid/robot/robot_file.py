@@ -142,6 +142,8 @@ def read_robot(path: Path) -> RobotRecord:
     written, computed = content.pop("checksum", None), checksum(content)
     before = content.pop("schema") == BEFORE
     units = content.pop("units", None)
+    if before and isinstance(units, dict):
+        units = {k: v for k, v in units.items() if not k.startswith("gains.")}
     known = isinstance(units, dict) and units.items() <= UNITS.items() if before else units == UNITS
     if not known:
         raise DataError(
@@ -176,6 +178,8 @@ def _with_assumed(content: Mapping[str, Any]) -> dict[str, object]:
         "sensors are assumed; write the file again with `slipid identify`"
     )
     found: dict[str, object] = {"nominal": None, **content}
+    # gains that earlier versions tuned in simulation are designed or set by hand now
+    found.pop("gains", None)
     found |= {"limits": asdict(limits), "actuators": asdict(ActuatorRecord())}
     if isinstance(messages := content.get("messages"), list):
         found["messages"] = [*messages, message]

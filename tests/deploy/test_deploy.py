@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
+from slipid.deploy.deploy import DRAWS, deploy, read_robot
 from slipid.deploy.robot_record import DIRECTIONS
 from slipid.fitting.shared_effects import SpeedAndLoad, TravelConditions
 from slipid.infer.fit_file import load
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.gains import Gains
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.robot.limits import Limits
 from slipid.robot.record import Setting
 from slipid.support.errors import DataError
-from slipid.support.files import checksum, write_json
-from tests.helpers.shared import DRIVES, invoke
+from tests.helpers.shared import DRIVES
 
 TRIAL = ("--plant", "twin", "--starts", 1, "--controllers", "encoder")
 pytestmark = pytest.mark.slow  # a fit
@@ -96,46 +93,6 @@ def test_after_sampling_no_two_files_disagree(fitted, sampled):
     assert record.numbers != before.numbers
     assert any("did not converge" in message for message in record.messages)
     assert len(set(record.draws["surface.soft.creep"])) > DRAWS // 4
-
-
-def test_gains_of_an_older_file_outlive_the_same_numbers_and_are_driven_with(fitted, tmp_path):
-    out, fit = tmp_path / "out", load(fitted)
-    shutil.copytree(fitted, out)
-    older = json.loads((out / "robot.json").read_text()) | {"gains": older_gains()}
-    older["checksum"] = checksum({k: v for k, v in older.items() if k != "checksum"})
-    write_json(out / "robot.json", older)
-    tuned = agree(out).record
-    found = {name: gain["value"] for name, gain in older_gains()["values"].items()}
-    assert {name: getattr(tuned.gains.values, name).value for name in found} == found
-    write_robot(out, fit)
-    assert read_robot(out).record == tuned
-    del found["ahead"]
-    own = {name: float(gain) for name, gain in vars(Gains.of(read_robot(out))).items()}
-    tuned_too = {**{name: float(gain) for name, gain in vars(Gains()).items()}, **found}
-    for words, gains in (((), own), (("--tuned-gains",), tuned_too)):
-        done = invoke("trial", out, *TRIAL, *words)
-        assert done.exit_code == 0, done.output
-        assert json.loads((out / "trial.json").read_text())["gains"] == gains
-
-
-def older_gains() -> dict[str, object]:
-    """Tuned gains, as `slipid tune` of earlier versions wrote them into robot.json."""
-    units = {"place": "1/s", "yaw": "1/s", "integral": "1/s^2", "ahead": "1", "observer": "1"}
-    units["preview"] = "s"
-    values = {
-        name: {"value": 1.25 if unit == "1/s" else 0.25, "unit": unit, "spread": 0.1}
-        for name, unit in units.items()
-    }
-    return {
-        "values": values,
-        "load": "as_built",
-        "gyro": False,
-        "method": "gradient",
-        "loss": {"hand": 510.2, "tuned": 502.5},
-        "better_than_hand": 0.37,
-        "stability_margin": 0.004,
-        "verdict": "no better than by hand",
-    }
 
 
 def test_a_folder_without_a_robot_says_what_to_run(tmp_path):

@@ -15,8 +15,7 @@ from slipid.robot.gains import Gains, used_gains
 from slipid.robot.limits import Limits
 from slipid.robot.record import ActuatorRecord, LimitsRecord, Setting
 from slipid.robot.robot_file import declared_numbers
-from tests.helpers.exported import LOADS, doubtful, mecanum_robot
-from tests.helpers.known_robot import USED
+from tests.helpers.exported import doubtful, mecanum_robot
 
 
 def table(robot: DeployedRobot) -> list[dict[str, str]]:
@@ -112,12 +111,13 @@ def test_verdicts_warn(robot):
 
 
 def test_gains_are_those_the_controller_takes(robot):
-    moved = DeployedRobot.of(robot.record, LOADS[1])
-    by_hand, tuned = table(robot), table(moved)
+    late = ActuatorRecord(Setting(0.1, "logs"), Setting(0.03, "logs"))
+    known = DeployedRobot.of(replace(robot.record, actuators=late), robot.load_setup)
+    by_hand, designed = table(robot), table(known)
     assert by_hand[0]["verdict"] == "by hand"
-    assert tuned[0]["verdict"] == "tuned, better than set by hand"
-    assert values(tuned, "gains")[: len(USED)] == USED
-    assert "the tuned gains are for the load set-up moved" in table_files(robot)["gains.md"]
+    assert designed[0]["verdict"] == "designed"
+    assert values(designed, "gains")[0] == float(Gains.of(known).place) != Gains().place
+    assert "a phase margin of 60 deg" in table_files(known)["gains.md"]
 
 
 def test_tables_for_reading_hold_whatever_a_name_is(robot):

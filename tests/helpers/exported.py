@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from slipid.model.geometry import Geometry, mecanum, omni
 from slipid.model.robot import build
 from slipid.robot.deployed import DeployedRobot
-from tests.helpers.known_robot import GAINS, deploy_known
+from tests.helpers.known_robot import deploy_known
 
 ODD = ('wet | "sand" -->', "class", "Wet sand", "2nd")
 """Names of floors that no parameter can have, two of them alike in letters and digits but one."""
@@ -42,7 +42,7 @@ def known(shape: Geometry, floors: Sequence[str] = ("firm", "soft")) -> Deployed
 
 
 def doubtful() -> DeployedRobot:
-    """An omni robot with odd names, messages, tuned gains and numbers of every verdict."""
+    """An omni robot with odd names, messages and numbers of every verdict."""
     shape = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
     robot = known(shape, ODD)
     numbers = dict(robot.record.parameters)
@@ -61,7 +61,7 @@ def doubtful() -> DeployedRobot:
         numbers["robot.drive_offset"], value=(0.001, -0.002, 1 / 3000)
     )
     said = ('say "aloud",\n"x\x07 --> | and*/ more',)
-    record = replace(robot.record, parameters=numbers, messages=said, gains=GAINS)
+    record = replace(robot.record, parameters=numbers, messages=said)
     return DeployedRobot.of(record, LOADS[0])
 
 

@@ -14,11 +14,7 @@ from slipid.model.robot import Robot
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.record import (
     EffectRecord,
-    GainRecord,
-    GainsRecord,
-    GainValues,
     LimitsRecord,
-    Losses,
     Setting,
 )
 
@@ -26,20 +22,6 @@ ROBOTINO = LimitsRecord(
     *(Setting(value, "config") for value in (0.5, 2.0, 1.0, 13.0, 22.0)),
 )
 """Limits of a Robotino; those of `slipid.robot.limits.Limits` by default."""
-
-GAINS = GainsRecord(
-    values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
-    load="moved",
-    gyro=True,
-    method="pso",
-    loss=Losses(2.0, 1.0),
-    better_than_hand=0.7,
-    stability_margin=0.02,
-    verdict="better than by hand",
-)
-"""Tuned for a load set-up named "moved"."""
-USED = [0.0, 0.1, 0.2, 0.4, 0.5]
-"""Values of those that a controller takes."""
 
 
 def deploy_known(

@@ -17,11 +17,12 @@ from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.gains import Gains
 from slipid.robot.interface import Measurement, Settings
 from slipid.robot.limits import Limits
+from slipid.robot.record import ActuatorRecord, Setting
 from slipid.robot.trajectory import waypoints
 from slipid.robot.twin import Twin, TwinPlant
 from tests.helpers import small_twin
 from tests.helpers.compilations import compilations
-from tests.helpers.known_robot import GAINS, deploy_known
+from tests.helpers.known_robot import deploy_known
 
 REFERENCE = jnp.array([0.3, 0.1, 0.2, 0.2, 0.0, 0.1])
 PATH = waypoints([(0.0, 0.0), (0.1, 0.0)])
@@ -58,8 +59,8 @@ def robot(load: str = "as_built", scale: float = 1.0) -> DeployedRobot:
         highest_speed=8.0 * scale,
         current_trend=(0.0, 0.1),
     )
-    record = replace(plain.record, gains=replace(GAINS, load=load), alike=3.0 / scale)
-    return DeployedRobot.of(record)
+    late = ActuatorRecord(Setting(0.1 * scale, "logs"), Setting(0.03, "logs"))
+    return DeployedRobot.of(replace(plain.record, actuators=late, alike=3.0 / scale))
 
 
 @pytest.fixture(scope="module")

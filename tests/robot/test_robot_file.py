@@ -21,15 +21,13 @@ from slipid.deploy.deploy import given_numbers
 from slipid.deploy.robot_record import robot_record
 from slipid.model.geometry import differential, omni
 from slipid.model.robot import Validity, build
-from slipid.parameter import entries
 from slipid.robot.deployed import DeployedRobot, posterior_robots
-from slipid.robot.gains import Gains
 from slipid.robot.interface import Settings
 from slipid.robot.limits import Limits
-from slipid.robot.record import EffectRecord, GainValues, Setting
+from slipid.robot.record import EffectRecord, Setting
 from slipid.support.errors import DataError
 from slipid.support.files import checksum
-from tests.helpers.known_robot import GAINS, USED, deploy_known
+from tests.helpers.known_robot import deploy_known
 
 SCHEMA = json.loads(resources.files("slipid.robot").joinpath("robot.schema.json").read_text())
 SEEN = Validity(
@@ -43,7 +41,7 @@ TOLD = EffectRecord((0.1, 0.3), (ONE, ONE[::-1]), (LEFT, LEFT[::-1]))
 
 @pytest.fixture(scope="module")
 def robot() -> DeployedRobot:
-    """Two floors, two load set-ups, odd numbers, draws and gains."""
+    """Two floors, two load set-ups, odd numbers and draws."""
     made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"], ["own", "moved"])
     share = jnp.asarray([[0.29, 0.44, 0.27], [0.1, 0.2, 0.7]])
     friction = jnp.asarray([1 / 3, 0.1 + 0.2])
@@ -76,7 +74,7 @@ def robot() -> DeployedRobot:
         made, numbers, std, several, 8.1, (0.01, -0.02), {"firm": SEEN}, {"moved": TOLD}
     )
     record = replace(record, messages=("say \u00e9 aloud",), versions={"jax": "0.1"})
-    return DeployedRobot.of(replace(record, gains=GAINS), "moved")
+    return DeployedRobot.of(record, "moved")
 
 
 @pytest.fixture
@@ -109,23 +107,6 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     first.save(path)
     assert path.read_bytes() == text
     assert len(text) < 20_000
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("verdict", ["no better than by hand", "worse than by hand"])
-def test_gains_that_are_not_known_to_be_better_are_read_and_not_used(tmp_path, robot, verdict):
-    gains = replace(GAINS, verdict=verdict)
-    DeployedRobot.of(replace(robot.record, gains=gains), "moved").save(tmp_path / "robot.json")
-    back = DeployedRobot.load(tmp_path / "robot.json", "moved")
-    assert back.record.gains == gains
-    assert jax.tree.leaves(Gains.of(back)) == jax.tree.leaves(Gains())
-    assert jax.tree.leaves(Gains.of(back, forced=True))[:5] == USED
-
-
-def test_gains_are_those_of_the_load_set_up_they_were_tuned_for(path):
-    tuned, other = DeployedRobot.load(path, "moved"), DeployedRobot.load(path, "own")
-    assert jax.tree.leaves(Gains.of(tuned))[:5] == USED
-    assert jax.tree.leaves(Gains.of(other)) == jax.tree.leaves(Gains())
 
 
 def test_draws_are_robots_with_other_numbers(robot):
@@ -171,14 +152,11 @@ def test_floors_that_nobody_drove_on_are_saved_with_the_others(robot, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_schema_tells_what_is_written_and_names_every_gain(path, robot):
+def test_the_schema_describes_what_is_written(path, robot):
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     jsonschema.validate(json.loads(path.read_text()), SCHEMA)
     deploy_known(build(omni([0.0, 120.0, 240.0], 0.1, 0.03), ["a"])).save(path)
     jsonschema.validate(json.loads(path.read_text()), SCHEMA)
-    declared = [e.path for e in entries(Gains())]
-    tuned = [name for name in GainValues.__dataclass_fields__ if name != "ahead"]
-    assert declared[: len(tuned)] == tuned
 
 
 # what is refused -----------------------------------------------------------------------------
@@ -188,7 +166,7 @@ def write(path: Path, content: dict) -> None:
     """Any content, with hashes that are right."""
     content.pop("checksum", None)
     if "numbers" in content:
-        fixed = {"gains": None, "versions": {}, "messages": []}
+        fixed = {"versions": {}, "messages": []}
         numbers = {k: v for k, v in content.items() if k not in ("schema", "units", "numbers")}
         content["numbers"] = checksum(numbers | fixed)
     path.write_text(json.dumps(content | {"checksum": checksum(content)}))
@@ -251,7 +229,8 @@ def as_schema_7(content: dict) -> None:
     added += ("floors.calibration",)
     units = {k: v for k, v in content["units"].items() if not k.startswith(added)}
     sensors = {k: v for k, v in content["sensors"].items() if isinstance(v, bool)}
-    content.update(schema="slipid.robot/7", units=units, sensors=sensors)
+    units["gains.loss"], gains = "mm", {"values": {"yaw": {"value": 1.0}}, "load": "own"}
+    content.update(schema="slipid.robot/7", units=units, sensors=sensors, gains=gains)
     del content["limits"], content["actuators"], content["nominal"]
     for floor in content["floors"]:
         del floor["calibration"]
@@ -308,7 +287,7 @@ def test_a_changed_digit_is_refused(path):
     path.write_text(text.replace("0.003", "0.004", 1))
     assert "does not match its checksum" in refused(path)
     assert "write it again with `slipid identify`" in refused(path)
-    path.write_text(text.replace('"gyro": true', '"gyro": false', 1))
+    path.write_text(text.replace('"voltage": false', '"voltage": true', 1))
     assert "does not match its checksum" in refused(path)
 
 
@@ -407,7 +386,6 @@ def test_a_changed_digit_is_refused(path):
             lambda c: c["units"].update(alike="m"),
             "the units in this file differ from the units of slipid.robot/8",
         ),
-        (lambda c: c["gains"]["values"].pop("yaw"), "gains.values.yaw is missing"),
         (
             lambda c: c.update(loads=c["loads"][:1] * 2),
             "expected at least one name, and each name only once",

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
@@ -80,7 +79,10 @@ ROWS: Mapping[str, ControllerRow] = {
         "encoder", "law of Indiveri, whose speed limit keeps the direction", law=_indiveri
     ),
     "true_pose": ControllerRow(
-        "contact", "the controller's own limit: fixes of the true pose", tuned=True, true_pose=True
+        "contact",
+        "the controller's own limit: fixes of the true pose",
+        designed=True,
+        true_pose=True,
     ),
 }
 """Controllers keyed by name: slipid's and the 2021 paper's, the published control laws, and the
@@ -130,39 +132,3 @@ def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
         suited = [name for name, row in ROWS.items() if not row.obstacle(robot)]
         raise DataError(f"{reasons}; expected one of {', '.join(suited)}")
     return kept
-
-
-def check_gains(out: Path, robot: DeployedRobot) -> None:
-    """Raise `DataError` if robot.json in `out` has no tuned gains for the robot's load set-up."""
-    tuned, path = robot.record.gains, out / "robot.json"
-    if tuned is None:
-        raise DataError(f"{path}: the robot has no tuned gains; omit --tuned-gains")
-    if tuned.load != robot.load_setup:
-        raise DataError(
-            f"{path}: gains were tuned for another load set-up ({tuned.load}), not for "
-            f"{robot.load_setup}; omit --tuned-gains, or drive with --load {tuned.load}"
-        )
-
-
-def unused_gains(robot: DeployedRobot, forced: bool) -> str:
-    """Return a sentence that says which tuned gains of the robot file are not used, and why.
-
-    The text is empty if all tuned gains are used, or if the file has none. `forced` is True if the
-    option --tuned-gains is given.
-    """
-    tuned = robot.record.gains
-    if tuned is None:
-        return ""
-    if tuned.load != robot.load_setup:
-        return f"gains were tuned for load set-up {tuned.load}: they are not used"
-    if not (tuned.is_better or forced):
-        return (
-            f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
-            f"{tuned.loss.hand:.1f} mm) and not used; use --tuned-gains for the tuned gains"
-        )
-    if tuned.values.ahead.value == 0.0:
-        return ""
-    return (
-        f"tuned gain ahead = {tuned.values.ahead.value:g} is ignored: controllers no longer use "
-        "wheel speeds of the contact model"
-    )

@@ -37,8 +37,6 @@ from slipid.lab.trial.controllers import (
     ROWS,
     TruePosePlant,
     applicable,
-    check_gains,
-    unused_gains,
 )
 from slipid.lab.trial.summary import TrialRun, best_controllers, summaries, verdict
 from slipid.robot import closed_loop, trajectory
@@ -80,7 +78,6 @@ class TrialTask:
         site: the test site; unused for the twin.
         settings: settings of the estimator.
         actuators: delay, lag and limits of the twin's wheel speeds.
-        forced: True if tuned gains are used even if they are no better than hand-set ones.
         kept: checkpoint that stores finished runs.
     """
 
@@ -96,7 +93,6 @@ class TrialTask:
     site: Site
     settings: Settings
     actuators: ActuatorModel
-    forced: bool
     kept: Checkpoint
 
 
@@ -117,7 +113,6 @@ class TrialOptions:
         speed: speed along the path [m/s].
         starts: number of starts.
         load: name of the load set-up; None for the first.
-        tuned_gains: True to use tuned gains even if they are no better than hand-set ones.
     """
 
     plant: str = "testsite"
@@ -129,7 +124,6 @@ class TrialOptions:
     speed: float = 0.2
     starts: int = 20
     load: str | None = None
-    tuned_gains: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +164,6 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
             omitted.setdefault(obstacle, []).append(name)
     for obstacle, names in omitted.items():
         report.line(f"omitted: {', '.join(names)} ({obstacle})")
-    if unused := unused_gains(tasks[0].robot, options.tuned_gains):
-        report.line(unused)
     todo = {task.name: task for task in tasks if _finished_run(task) is None}
     report.stage(f"driving {len(todo)} of {len(tasks)} runs")
     results(executor, drive, todo, report)
@@ -189,7 +181,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
         "told_map": None if options.told_map is None else str(options.told_map),
         "path": options.path,
         "speed_m_s": options.speed,
-        "gains": _gains(tasks[0].robot, options.tuned_gains),
+        "gains": _gains(tasks[0].robot),
         "closes_best": None if len(best) > 1 else best[0],
         "not_told_apart": best,
         "verdict": verdict(compared, needs, tasks[0].robot.record.sensors.gyro),
@@ -224,9 +216,7 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
         require_known_surfaces(floor, robot, str(options.map))
     if options.told_map is not None:
         require_known_surfaces(known_map, robot, str(options.told_map))
-    if options.tuned_gains:
-        check_gains(out, robot)
-    gains = _gains(robot, options.tuned_gains)
+    gains = _gains(robot)
     about = options.plant, options.path, options.speed, robot.load_setup, gains
     key = key_of(
         *(*about, json.dumps(site.to_json()), settings, actuators, *jax.tree.leaves(robot)),
@@ -237,16 +227,15 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     # trials with other gains or floors have separate folders, so that their runs stay reusable
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{options.starts}", key)
     shared = options.plant, floor, known_map, robot, site, settings, actuators
-    forced = options.tuned_gains
     return [
-        TrialTask(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared, forced, kept)
+        TrialTask(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared, kept)
         for row in applicable(options.controllers, robot)
         for k, start in enumerate(starts(options.starts, floor, path))
     ]
 
 
-def _gains(robot: DeployedRobot, forced: bool) -> dict[str, float]:
-    gains = Gains.of(robot, forced)
+def _gains(robot: DeployedRobot) -> dict[str, float]:
+    gains = Gains.of(robot)
     return {f.name: float(getattr(gains, f.name)) for f in fields(gains)}
 
 
@@ -276,7 +265,7 @@ def drive(task: TrialTask) -> None:
         plant = TruePosePlant(plant)
     there = floor_of(task.known_map, robot.labels)
     sees = row.gyro or row.true_pose
-    loop = control_loop_of(robot, row, task.settings, task.forced, there, recovery=sees)
+    loop = control_loop_of(robot, row, task.settings, there, recovery=sees)
     driven = closed_loop.run_closed_loop(loop, path, plant, task.start)
     off = driven.pose[-1] - driven.estimated_pose[-1]
     run = TrialRun(

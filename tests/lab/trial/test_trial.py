@@ -22,8 +22,6 @@ from slipid.lab.trial.controllers import (
     ROWS,
     TruePosePlant,
     applicable,
-    check_gains,
-    unused_gains,
 )
 from slipid.lab.trial.published_laws import GoswamiPadhy
 from slipid.lab.trial.summary import TrialRun, best_controllers, columns, summaries, verdict
@@ -41,7 +39,7 @@ from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.gains import Gains
 from slipid.robot.interface import Measurement, Settings
-from slipid.robot.record import GainRecord, GainsRecord, GainValues, Losses
+from slipid.robot.record import ActuatorRecord, Setting
 from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
 from slipid.support.toml_file import text_of
@@ -86,7 +84,7 @@ def pair():
 
 
 MORE = {
-    "there and back": [reference.Section(0.5), reference.Section(-0.5)],
+    "there and back": [reference.PathSection(0.5), reference.PathSection(-0.5)],
     "with arcs": reference.rectangle_shape(1.35, 0.6, 0.2),
 }
 
@@ -108,7 +106,7 @@ def test_a_robot_that_does_not_drive_sideways_closes_its_paths(pair, name, besid
 
 @pytest.mark.slow
 def test_turns_on_the_spot_have_no_side(deployed):
-    sides = reference.Section(0.3), reference.Turn(np.pi), reference.Section(0.3)
+    sides = reference.PathSection(0.3), reference.Turn(np.pi), reference.PathSection(0.3)
     half = reference.Turn(-np.pi)
     for shape, expected in (([half], ()), ([*sides, half, half], (300.0, 300.0))):
         course = closed_loop.run_closed_loop(
@@ -202,14 +200,16 @@ def test_the_distance_from_a_path_is_from_its_line():
     )
 
 
-def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
-    tuned = Gains(*TUNED)
-    robot = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
+def test_rows_of_the_paper_have_its_loop_and_ours_the_designed_gains(deployed):
+    late = ActuatorRecord(Setting(0.1, "logs"), Setting(0.03, "logs"))
+    robot = DeployedRobot.of(replace(deployed.record, actuators=late))
+    designed = Gains.of(robot)
+    assert values(designed) != values(Gains())
     for row in ROWS.values():
         if row.law is not None or row.obstacle(robot):  # a law takes a second to make
             continue
         found = control_loop_of(robot, row).controller.gains
-        expected = tuned if row.tuned else Gains()
+        expected = designed if row.designed else Gains()
         if row.observer in ("encoder", "curve"):
             expected = replace(expected, preview=jnp.asarray(0.0))
         assert values(found) == values(expected)
@@ -568,7 +568,7 @@ def test_a_controller_can_have_another_map_than_the_true_one(tmp_path, deployed,
     class Told(Exception):
         pass
 
-    def caught(robot, row, settings, forced, floor, recovery):
+    def caught(robot, row, settings, floor, recovery):
         raise Told(floor)
 
     monkeypatch.setattr(tr, "control_loop_of", caught)
@@ -584,50 +584,6 @@ def test_a_controller_can_have_another_map_than_the_true_one(tmp_path, deployed,
 
 def values(gains):
     return [float(x) for x in jax.tree.leaves(gains)]
-
-
-TUNED = [0.5, 1.5, 2.5, 4.5, 5.5]
-
-
-def tuned_for(load, verdict="better than by hand", ahead=0.0):
-    values = GainValues(*(GainRecord(k, "1", 0.1) for k in (*TUNED[:3], ahead, *TUNED[3:])))
-    losses = Losses(hand=2.0, tuned=1.0)
-    return GainsRecord(values, load, False, "pso", losses, 0.9, 0.01, verdict)
-
-
-def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
-    assert values(Controller(deployed).gains) == values(Gains())
-    assert unused_gains(deployed, forced=False) == ""
-    tuned = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
-    check_gains(tmp_path, tuned)
-    assert values(Controller(tuned).gains)[:5] == TUNED
-    assert unused_gains(tuned, forced=False) == ""
-    other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
-    assert values(Controller(other).gains) == values(Gains())
-    assert "tuned for load set-up far: they are not used" in unused_gains(other, False)
-    with pytest.raises(DataError, match=r"another load set-up \(far\), not for as_built; omit"):
-        check_gains(tmp_path, other)
-    with pytest.raises(DataError, match="the robot has no tuned gains; omit --tuned-gains"):
-        check_gains(tmp_path, deployed)
-
-
-def test_tuned_gains_that_are_no_better_are_not_used_and_that_is_reported(deployed):
-    gains = tuned_for("as_built", "no better than by hand")
-    robot = DeployedRobot.of(replace(deployed.record, gains=gains))
-    said = unused_gains(robot, forced=False)
-    assert said.startswith("tuned gains are no better than by hand (loss 1.0 mm, by hand 2.0 mm)")
-    assert "--tuned-gains" in said
-    row = ROWS["contact"]
-    assert values(control_loop_of(robot, row).controller.gains) == values(Gains())
-    assert unused_gains(robot, forced=True) == ""
-    assert values(control_loop_of(robot, row, forced=True).controller.gains)[:5] == TUNED
-
-
-def test_a_file_with_a_removed_gain_drives_with_the_others_and_that_is_reported(deployed):
-    gains = tuned_for("as_built", ahead=0.7)
-    robot = DeployedRobot.of(replace(deployed.record, gains=gains))
-    assert values(control_loop_of(robot, ROWS["contact"]).controller.gains)[:5] == TUNED
-    assert "tuned gain ahead = 0.7 is ignored" in unused_gains(robot, forced=False)
 
 
 def run_of(name, k, closure, finished=True, recoveries=0, freed=0):
