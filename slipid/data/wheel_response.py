@@ -91,9 +91,11 @@ def wheel_response(logs: Sequence[Log], shape: Geometry) -> WheelResponse | None
         return None
     model = _Model.of(kept)
     slews = np.log(np.array(ACCELERATIONS) / radius)
-    grid = np.stack(np.meshgrid(DELAYS, LAGS, slews), -1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(DELAYS, LAGS, slews, indexing="ij"), -1).reshape(-1, 3)
     few = _Model.of(kept[:: max(1, len(kept) // GRID_RUNS)])
-    best = grid[int(np.argmin([(few.residuals(one[None]) ** 2).sum() for one in grid]))]
+    # points of one delay at once: the model's loop over time costs the same for many points
+    losses = [few.residuals(part).reshape(len(part), -1) for part in np.split(grid, len(DELAYS))]
+    best = grid[int(np.argmin(np.concatenate([(x**2).sum(axis=1) for x in losses])))]
     point = _refined(model, best)
     if point is None:
         return None

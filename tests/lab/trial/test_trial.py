@@ -634,10 +634,11 @@ def test_the_verdict_names_what_the_best_controllers_need():
 
     noise = rng.uniform(0.7, 1.25, 20)
     rows = {"encoder": 2.0, "calibrated": 1.0, "contact": noise, "contact_gyro": 0.2}
+    better = np.median(noise * base) < np.median(base)
+    first, second = ("contact", "calibrated") if better else ("calibrated", "contact")
     assert said(**rows) == (
         "closes best: contact_gyro (with a gyro, which your logs do not have); without a gyro: "
-        f"{'contact' if np.median(noise * base) < np.median(base) else 'calibrated'}, not "
-        f"distinguished from {'calibrated' if np.median(noise * base) < np.median(base) else 'contact'}"
+        f"{first}, not distinguished from {second}"
     )
     assert said(True, **rows).startswith("closes best: contact_gyro (with a gyro); without")
     assert said(encoder=1.0, contact=0.5) == "closes best: contact"
