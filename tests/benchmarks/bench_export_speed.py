@@ -1,7 +1,7 @@
-"""Time of a step of the generated C, beside C written by hand, and with many wheels and floors.
+"""Time of a step of the generated C, also with many wheels and floors, and of its contact balance.
 
 How it is run is at the head of `export_builds.py`. All times are of one process written in C, over
-a drive on the twin; those of two codes are taken in turns.
+a drive on the twin.
 """
 
 from __future__ import annotations
@@ -23,20 +23,8 @@ from slipid.lab.trial.controllers import ROWS
 from slipid.model import contact
 from slipid.model.contact_balance import stand
 from slipid.model.geometry import mecanum
-from slipid.robot.controller import (
-    LARGEST_INTEGRAL,
-    OBSERVER_S,
-    RECOVERY_DRIVE_S,
-    RECOVERY_GROWTH,
-    RECOVERY_LIMIT_S,
-    RECOVERY_TURN_S,
-    STUCK_S,
-)
-from slipid.robot.estimator import SLIP_CURRENT
 from slipid.robot.filter import hypotheses
 from slipid.robot.filter.hypotheses import hypotheses_of
-from slipid.robot.interface import UNTIMED_S, Settings
-from slipid.robot.limits import Limits
 from tests.benchmarks.export_builds import (
     FAST,
     HERE,
@@ -45,7 +33,6 @@ from tests.benchmarks.export_builds import (
     PLAIN,
     Fleet,
     code,
-    control_loop,
     driven,
     needs,
     ran,
@@ -70,14 +57,12 @@ class Took:
     state: int
 
 
-def timed(folder: Path, drive: Path, flags, more=(), said: Path | None = None) -> list[Took]:
-    """Times of the code in a folder, and of the reference if it is among more sources."""
-    words = ["gcc", "-std=c99", *flags, *more, "-I.", HERE / "export_time.c", "slipid.c", "-lm"]
+def timed(folder: Path, drive: Path, flags) -> Took:
+    """Return the times of the code in a folder."""
+    words = ["gcc", "-std=c99", *flags, "-I.", HERE / "export_time.c", "slipid.c", "-lm"]
     ran([*words, "-o", "timed"], folder)
-    last = [] if said is None else [said]
-    lines = ran(["./timed", drive, SECONDS, *last], folder).splitlines()
-    rows = [line.split() for line in lines]
-    return [Took(float(r[0]), float(r[1]), int(r[2])) for r in rows]
+    median, least, state = ran(["./timed", drive, SECONDS], folder).split()[:3]
+    return Took(float(median), float(least), int(state))
 
 
 def unfleeted(made: Code, folder: Path) -> Path:
@@ -96,7 +81,7 @@ def test_step(tmp_path, row, kind):
     alone = unfleeted(code(row), tmp_path / "alone")
     for name, flags in FLAGS.items():
         more = ("-fno-tree-pre",) if kind == "float" and flags == FAST else ()
-        took = timed(alone, drive, (*flags, *KINDS[kind], *more))[0]
+        took = timed(alone, drive, (*flags, *KINDS[kind], *more))
         print(
             f"\n{row} {kind} {' '.join((name, *more))}: median {took.median:.0f} ns a step "
             f"({took.median / BARS_NS[row]:.2f} of the bar), least {took.least:.0f}; "
@@ -105,77 +90,6 @@ def test_step(tmp_path, row, kind):
         )
         if kind == "double" and flags == FAST:
             assert QUICK or took.median <= BARS_NS[row]
-
-
-# beside C written by hand -----------------------------------------------------------------------
-
-
-def numbers() -> str:
-    """The robot's numbers as macros and tables, for the step written by hand."""
-    p, s = control_loop("slip_odometry"), Settings.of(three_floors())
-    f, k, most = p.controller.robot, p.controller.gains, Limits()
-    given = {
-        "RADIUS": f.frame.radius,
-        "HIGHEST_SPEED": f.highest[0],
-        "HIGHEST_CURRENT": f.highest[1],
-        "RESISTANCE": f.motor.resistance,
-        "VOLTS_PER_SPEED": f.motor.gear_ratio * f.motor.back_emf,
-        "PLACE": k.place,
-        "YAW": k.yaw,
-        "INTEGRAL": k.integral,
-        "OBSERVER": k.observer,
-        "SPEED_LIMIT": most.wheel_speed,
-        "ACCELERATION_LIMIT": most.acceleration / f.frame.radius,
-        "VOLTAGE_LIMIT": most.voltage,
-        "TWIST_LIMIT": most.speed,
-        "LONGEST_I": LARGEST_INTEGRAL,
-        "OBSERVE": OBSERVER_S,
-        "STUCK": STUCK_S,
-        "TURN": RECOVERY_TURN_S,
-        "GO": RECOVERY_DRIVE_S,
-        "RECOVERY_GROWTH": RECOVERY_GROWTH,
-        "GIVES_UP": RECOVERY_LIMIT_S,
-        "CURRENT_FROM": SLIP_CURRENT,
-        "UNTIMED": UNTIMED_S,
-        "STALE": s.stale_s,
-        "LONGEST": s.longest_s,
-    }
-    tables = {"FORWARD": f.forward, "INVERSE": f.inverse, "CURVE": f.wheel_curve}
-    lines = [f"#define {name} ({float(value)!r})" for name, value in given.items()]
-    for name, value in tables.items():
-        rows = ", ".join("{" + ", ".join(repr(float(x)) for x in row) + "}" for row in value)
-        lines.append(f"static const double {name}[{len(value)}][{len(value[0])}] = {{{rows}}};")
-    return "\n".join(lines) + "\n"
-
-
-def test_odometry_beside_one_by_hand(tmp_path):
-    made = code("slip_odometry")
-    fleet = Fleet(made, tmp_path, FAST)
-    drive = driven(made, three_floors(), fleet).write(tmp_path / "drive")
-    alone = unfleeted(made, tmp_path / "alone")
-    (alone / "numbers.h").write_text(numbers())
-    reference = ["-DREFERENCE", HERE / "reference_odometry.c"]
-    said = tmp_path / "said"
-    row = np.dtype(
-        [("estimate", fleet.estimate.dtype), ("command", float, fleet.command.shape)], align=True
-    )
-    for name, flags in FLAGS.items():
-        ours, theirs = timed(alone, drive, flags, reference, said)
-        both = np.fromfile(said, row).reshape(2, -1)
-        apart = max(
-            float(np.abs(np.diff(x.astype(float), axis=0)).max(initial=0.0))
-            for x in (*(both["estimate"][n] for n in fleet.estimate.dtype.names), both["command"])
-        )
-        lean = timed(alone, drive, flags, ["-DLEAN", *reference])
-        print(
-            f"\nslip_odometry {name}: generated {ours.median:.0f} ns, by hand "
-            f"{theirs.median:.0f} ns, ratio {ours.median / theirs.median:.2f} (bar {BESIDE}); by "
-            f"hand without what never changes {lean[1].median:.0f} ns, ratio "
-            f"{lean[0].median / lean[1].median:.2f}; apart {apart:.1e}",
-            end="",
-        )
-        assert apart <= 1e-12
-        assert QUICK or flags != FAST or ours.median <= BESIDE * theirs.median
 
 
 def settled(folder: Path) -> tuple[int, np.ndarray]:
@@ -261,7 +175,7 @@ def test_many_floors(tmp_path, monkeypatch, floors, changes):
     made = Code(robot, control_loop_of(robot, ROWS["contact"]), PATH)
     fleet = Fleet(made, tmp_path, FAST)
     drive = driven(made, robot, fleet, 400).write(tmp_path / "drive")
-    took = timed(unfleeted(made, tmp_path / "alone"), drive, FAST)[0]
+    took = timed(unfleeted(made, tmp_path / "alone"), drive, FAST)
     print(
         f"\nfour wheels, {floors} floors, {len(hypotheses_of(robot))} of {floors**4} combinations: "
         f"median {took.median / 1000:.1f} us a step, least {took.least / 1000:.1f}; state "

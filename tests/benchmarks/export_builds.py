@@ -102,12 +102,12 @@ class Fleet(CompiledC):
         super().__init__(made, folder, (*flags, "-I.", str(HERE / "export_fleet.c")))
         parts = [("estimator", self.estimator.dtype), ("controller", self.controller.dtype)]
         self.state = np.dtype([*parts, ("time", self.kinds.real)], align=True)
-        assert self._library.fleet_state_size() == self.state.itemsize
+        assert self.library.fleet_state_size() == self.state.itemsize
 
     def start(self, count: int) -> np.ndarray:
         """States of robots at 0, 0, 0."""
         out = np.zeros(count, self.state)
-        self._library.fleet_init(ctypes.c_int32(count), out.ctypes.data_as(ctypes.c_void_p))
+        self.library.fleet_init(ctypes.c_int32(count), out.ctypes.data_as(ctypes.c_void_p))
         return out
 
     def drive(
@@ -120,7 +120,7 @@ class Fleet(CompiledC):
         command = np.zeros((count, len(self.command)), self.kinds.real)
         arrays = (state, reading, said, reference, command)
         pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in arrays]
-        self._library.fleet_drive(ctypes.c_int32(count), self._number(PERIOD), *pointers)
+        self.library.fleet_drive(ctypes.c_int32(count), self._number(PERIOD), *pointers)
         return said, reference, command
 
 

@@ -1,34 +1,19 @@
 /* Time of one step of the generated code, over a drive that is repeated from its start: median and
-   shortest of the passes' mean processor times in ns, size of the state, count of passes. With
-   REFERENCE reference_step takes turns with it. A last file gets the estimates and commands. */
+   shortest of the passes' mean processor times in ns, size of the state, count of passes. */
 #define _POSIX_C_SOURCE 199309L
 #include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 #include <time.h>
 
 #include "slipid.h"
 
-typedef void step_t(slipid_state *, const slipid_reading *, const slipid_real *, slipid_real,
-                    slipid_estimate *, slipid_real *);
-
-#ifdef REFERENCE
-void reference_step(slipid_state *state, const slipid_reading *reading,
-                    const slipid_real reference[6], slipid_real dt, slipid_estimate *estimate,
-                    slipid_real command[SLIPID_WHEELS]);
-static step_t *const steps[] = {slipid_step, reference_step};
-#define WAYS 2
-#else
-static step_t *const steps[] = {slipid_step};
-#define WAYS 1
-#endif
 #define MOST 20000
 
 static slipid_state state;
 static slipid_estimate estimate;
 static slipid_reading *reading;
-static slipid_real *reference, *passed, command[SLIPID_WHEELS];
-static double took[WAYS][MOST];
+static slipid_real *reference, *passed, command[SLIPID_DRIVES];
+static double took[MOST];
 
 static double now(void) {
   struct timespec t;
@@ -36,16 +21,12 @@ static double now(void) {
   return 1e9 * (double)t.tv_sec + (double)t.tv_nsec;
 }
 
-static double pass(step_t *step, long count, FILE *into) {
+static double pass(long count) {
   const slipid_real pose[3] = {0, 0, 0};
   slipid_init(&state, pose);
   const double began = now();
   for (long k = 0; k < count; ++k) {
-    step(&state, &reading[k], &reference[6 * k], passed[k], &estimate, command);
-    if (into) {
-      fwrite(&estimate, sizeof estimate, 1, into);
-      fwrite(command, sizeof command, 1, into);
-    }
+    slipid_step(&state, &reading[k], &reference[6 * k], passed[k], &estimate, command);
   }
   return (now() - began) / (double)count;
 }
@@ -73,23 +54,12 @@ int main(int argc, char **argv) {
   reading = rows(file, count, sizeof *reading);
   reference = rows(file, 6 * count, sizeof *reference);
   passed = rows(file, count, sizeof *passed);
-  FILE *into = argc > 3 ? fopen(argv[3], "wb") : NULL;
-  for (int way = 0; way < WAYS; ++way) {
-    pass(steps[way], count, into); /* warms up */
-  }
-  if (into) {
-    fclose(into);
-  }
+  pass(count); /* warms up */
   int passes = 0;
   for (const double end = now() + 1e9 * seconds; passes < MOST && (now() < end || passes < 9);) {
-    for (int way = 0; way < WAYS; ++way) {
-      took[way][passes] = pass(steps[way], count, NULL);
-    }
-    ++passes;
+    took[passes++] = pass(count);
   }
-  for (int way = 0; way < WAYS; ++way) {
-    qsort(took[way], (size_t)passes, sizeof(double), by_size);
-    printf("%.2f %.2f %zu %d\n", took[way][passes / 2], took[way][0], sizeof state, passes);
-  }
+  qsort(took, (size_t)passes, sizeof(double), by_size);
+  printf("%.2f %.2f %zu %d\n", took[passes / 2], took[0], sizeof state, passes);
   return 0;
 }
