@@ -393,7 +393,9 @@ def geometry_choices(found: Calibration, shape: Geometry, free: Collection[str])
     The base radius is that of the force balance only for wheels on one axle and for wheels that
     determine the twist: the effective track of a skid steer follows from its slip. Radii of the
     drives are fitted for wheels that point ahead only, since on omni wheels slip that depends on
-    the load looks the same.
+    the load looks the same. Rolling radii on all floors but the firmest are fitted for a skid steer
+    only, whose turns show how much its wheels slip: on one axle, slip against a rolling resistance
+    looks the same as a smaller radius.
 
     Args:
         found: the calibration.
@@ -428,6 +430,14 @@ def geometry_choices(found: Calibration, shape: Geometry, free: Collection[str])
                 free=True,
             )
         )
+        if all(shape.grips) and not is_axle(shape):
+            mean = np.log(radii.mean())
+            for floor in sorted(found.radius.keys() - {found.firmest}):
+                soft = found.radius[floor]
+                if any(v.verdict not in known for v in soft):
+                    continue
+                ratio = float(np.log(np.mean([v.value for v in soft])) - mean)
+                out.append(Choice(f"surface.{floor}.rolling_radius", start=ratio, free=True))
     if base.verdict in known and (shape.determines_twist or is_axle(shape)):
         nominal = float(shape.base_radius)
         out.append(

@@ -290,5 +290,7 @@ def _robot_of(kept: Content) -> Robot:
     )
     names = kept["surfaces"], kept["loads"], kept["sessions"]
     robot = build(geometry, *names, centre=tuple(kept["centre"]))
-    restored: Robot = with_values(robot, {e: kept["values"][e.path] for e in entries(robot)})
+    # a parameter that is newer than the file has its start value
+    known = {e: kept["values"][e.path] for e in entries(robot) if e.path in kept["values"]}
+    restored: Robot = with_values(robot, known)
     return restored

@@ -35,6 +35,7 @@ class Stance(eqx.Module):
         drag_onset: roller speed below which drag is viscous [m/s].
         friction: mean friction coefficient of the wheels; forces are in units of friction m g.
         roller_scale: roller drag of each wheel if all wheels carry the same load.
+        rolling: rolling radius on the floor over the radius of the wheel.
     """
 
     frame: WheelFrame
@@ -46,6 +47,7 @@ class Stance(eqx.Module):
     drag_onset: Float[Array, "wheel *one"]
     friction: Float[Array, "*batch"]
     roller_scale: Float[Array, "wheel *batch"]
+    rolling: Float[Array, "wheel *batch"]
 
 
 def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
@@ -67,12 +69,12 @@ def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel
             lead=total(rest * surface.lead),
         )
     roller_scale = (1 - frame.grip) * floor.friction * floor.roller_drag / len(rest)
+    rolling = jnp.exp(frame.grip * floor.rolling_radius)
     floor, onset = law.sideways(law.at_load(floor, len(rest) * rest), frame.grip)
     # Components are the first axis, so that XLA stores each, and its derivatives, contiguously.
     hold, roll, shift = (jnp.moveaxis(r, 1, 0) for r in (frame.hold, frame.roll, frame.shift))
-    return Stance(
-        frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction, roller_scale
-    )
+    scales = friction, roller_scale, rolling
+    return Stance(frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, *scales)
 
 
 def total(of_wheels: Float[Array, "wheel *batch"]) -> Float[Array, "*batch"]:
@@ -93,7 +95,8 @@ class Balance(eqx.Module):
 
     def at(self, xi: Planar) -> "BalanceAt":
         """Return the forces at a twist."""
-        return BalanceAt(self.rim, self.on, xi)
+        rim = self.rim * self.on.rolling if self.on.frame.ordinary else self.rim
+        return BalanceAt(rim, self.on, xi)
 
     def force(self, xi: Planar) -> Planar:
         """Return the resultant force on the body, zero at equilibrium."""
@@ -109,7 +112,8 @@ class BalanceAt:
     """Forces of a `Balance` at one twist; values that several forces need are traced once.
 
     Attributes:
-        rim, on: as in `Balance`.
+        rim: rim speeds with the rolling radius on the floor [m/s].
+        on: as in `Balance`.
         xi: the twist.
     """
 

@@ -22,6 +22,10 @@ their total sliding: with m_i = sqrt(vs_i^2 + q_i^2) the first terms of T_i and 
 
     N_i tanh(m_i / (v0 + s0 c_i)) vs_i / m_i,     -N_i tanh(m_i / (v0 + s0 c_i)) q_i / m_i
 
+They sink into soft floors: r w_i exp(rho) takes the place of r w_i, with rho = 0 on the firmest
+floor, while the lever of the torque stays r. Without rho the fit takes the smaller radius for slip
+and predicts too large currents.
+
 Wheels may stand on different floors. Forces are then in units of mean(mu) m g, those of wheel i are
 weighted by mu_i / mean(mu), and b and cz are means over the loads. Creep and rolling resistance are
 rate-independent (s0 is a slip *ratio*): with a resistance that sets in at a fixed speed of 20 mm/s
@@ -45,7 +49,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.model.se2 import Planar
-from slipid.parameter import parameter
+from slipid.parameter import known, parameter
 
 _LIFTED = 0.03
 """Ratio of load to mean wheel load below which drag is proportional to load: p has no effect."""
@@ -102,6 +106,13 @@ class ContactSurface(eqx.Module):
         start=0.0,
         spread=0.05,
         deviation=True,
+    )
+    rolling_radius: Array = known(
+        "1",
+        "rho",
+        "log of the rolling radius relative to the firmest floor (fitted for a skid steer)",
+        start=0.0,
+        spread=0.1,
     )
     labels: tuple[str, ...] = eqx.field(static=True, default=())
 

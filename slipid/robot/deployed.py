@@ -379,7 +379,7 @@ EFFECT: Axes = (0.1, 0.1, 0.3)
 """Std of the effects on a hypothetical floor [m/m, m/m, rad/m]."""
 CURRENT_FACTOR = 1.5
 """Std of modelled currents on a hypothetical floor, relative to the mean of known floors [1]."""
-_SIGNED = ("lead", "load_bias")
+_SIGNED = ("lead", "load_bias", "rolling_radius")
 _UNSEEN_NAME = "unseen_{}"
 
 

@@ -29,6 +29,7 @@ from slipid.robot.record import (
     LimitsRecord,
     LogSensors,
     Numbers,
+    RecordedNumber,
     RobotRecord,
     Setting,
 )
@@ -153,16 +154,25 @@ def read_robot(path: Path) -> RobotRecord:
     try:
         if before:
             content = _with_assumed(content)
-        record: RobotRecord = typed(RobotRecord, content)
+        record = typed(RobotRecord, content)
+        same = before or numbers == record.numbers
+        record = _with_radii(record)
         check_record(record)
     except ValueError as error:
         raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
-    if written != computed or not (before or numbers == record.numbers):
+    if written != computed or not same:
         raise DataError(
             f"{path}: the content does not match its checksum, so it was changed or damaged after "
             f"it was written; {REWRITE_HINT}"
         )
     return record
+
+
+def _with_radii(record: RobotRecord) -> RobotRecord:
+    """Return a record with rolling radii of its floors, which earlier versions did not fit."""
+    paths = [f"surface.{name}.rolling_radius" for name in record.labels]
+    missing = {p: RecordedNumber(0.0, "1") for p in paths if p not in record.parameters}
+    return replace(record, parameters={**record.parameters, **missing})
 
 
 def _with_assumed(content: Mapping[str, Any]) -> dict[str, object]:

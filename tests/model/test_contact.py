@@ -90,6 +90,7 @@ def cases(kind, count, geometry=ROBOTINO, seed=0):
         floors,
         drag_exponent=jnp.asarray(rng.uniform(1.0, 1.6, count)),
         load_bias=jnp.asarray(bias - bias.mean(axis=1, keepdims=True)),
+        rolling_radius=jnp.asarray(rng.uniform(-0.1, 0.0, count)),
     )
     fast = np.abs(rim).max(axis=1) > 1.5
     rim[fast] *= 1.5 / np.abs(rim[fast]).max(axis=1, keepdims=True)
@@ -465,7 +466,9 @@ def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
     drive_share, through = np.asarray(frame.drive_share), np.asarray(frame.roller_share)
     along = np.asarray(xi) @ np.asarray(frame.hold).T
     roll = np.asarray(xi) @ np.asarray(frame.roll).T
-    traction, drag, rim = np.asarray(felt.traction), np.asarray(felt.drag), np.asarray(rim)
+    traction, drag = np.asarray(felt.traction), np.asarray(felt.drag)
+    radius = np.exp(np.asarray(frame.grip) * np.asarray(floors.rolling_radius)[:, None])
+    rim = np.asarray(rim) * radius
     held = (
         traction - drag * through
     ) / drive_share  # along the direction the rollers do not give way in

@@ -34,6 +34,7 @@ FLOORS = ContactSurface(
     scrub=jnp.array([0.002, 0.004]),
     lead=jnp.array([0.002, 0.004]),
     drag_exponent=jnp.array([1.1, 1.5]),
+    rolling_radius=jnp.array([0.0, -0.03]),
     labels=("a", "b"),
 )
 

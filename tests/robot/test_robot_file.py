@@ -106,7 +106,7 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     text = path.read_bytes()
     first.save(path)
     assert path.read_bytes() == text
-    assert len(text) < 20_000
+    assert len(text) < 21_000
 
 
 def test_draws_are_robots_with_other_numbers(robot):
@@ -252,6 +252,17 @@ def test_a_file_of_the_version_before_loads_and_says_what_is_assumed(path, robot
     rewritten(path, as_schema_7)
     path.write_text(path.read_text().replace("0.003", "0.004", 1))
     assert "does not match its checksum" in refused(path)
+
+
+def test_a_file_without_rolling_radii_has_those_of_the_wheels(path, robot):
+    def as_before(content):
+        for name in robot.labels:
+            assert content["parameters"].pop(f"surface.{name}.rolling_radius")
+
+    rewritten(path, as_before)
+    again = DeployedRobot.load(path, "moved")
+    same(again, robot)
+    np.testing.assert_array_equal(again.floors.rolling_radius, [0.0, 0.0])
 
 
 def test_limits_without_logs_follow_from_the_robots_own_wheels():
