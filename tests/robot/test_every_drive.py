@@ -93,6 +93,26 @@ def test_the_estimator_ends_nearer_than_encoders(driven):
 
 
 @pytest.mark.slow
+def test_a_robot_that_creeps_while_it_rests_still_finds_the_bias_of_its_gyro(driven):
+    """As a controller makes it that follows the drift of the heading."""
+    robot, _ = driven
+    estimator, rows, bias, turn = Estimator(robot), 60, 0.004, 0.003
+    speed = jnp.asarray(robot.forward[:, 2] * turn / robot.frame.radius)
+    angle, zero = 0.05 * jnp.arange(rows)[:, None] * speed, jnp.zeros((rows, robot.drives))
+    nothing = Readings.nothing(robot.drives)
+    z = jax.tree.map(lambda x: jnp.broadcast_to(x, (rows, *x.shape)), nothing)
+    gyro = jnp.full(rows, bias + turn)
+    z = replace(z, wheel_angle=angle, current=zero, gyro=gyro)
+
+    def step(state, row):
+        return estimator.advance(state, row, jnp.asarray(0.05))[0], None
+
+    state, _ = jax.jit(lambda s, z: jax.lax.scan(step, s, z))(estimator.init(), z)
+    assert float(state.place.still) > 1.0
+    assert float(state.place.nuisance[-1]) == pytest.approx(bias, abs=0.4 * turn)
+
+
+@pytest.mark.slow
 def test_wheels_of_a_drive_with_one_speed_move_the_body_as_declared(driven):
     robot, _ = driven
     rim = jnp.arange(1.0, robot.drives + 1)

@@ -43,6 +43,10 @@ CREEP_SPEED = 0.05
 """Speed below which a gyro's difference from the contact model is not used, since fitted runs are
 faster and the model is not known there [m/s]."""
 
+LASTING_ERROR = 0.01
+"""Std of an error of the model that lasts over `Settings.doubt_m`, such as while wheels cross the
+edges of floors, as a fraction of the rim speed [1]."""
+
 
 class _StepMotion(eqx.Module):
     """Motion of the body in a step with its derivatives.
@@ -166,7 +170,8 @@ class PoseFilter(eqx.Module):
         still = jnp.where(tick.moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         old = replace(old, history=history_after_jump(old, motion, self.robot.frame.base))
         new = replace(self._moved(old, pose, body, tick), still=still)
-        new = self._bias_at_rest(self._gyro_update(new, body, gyro, free[2], tick), gyro)
+        new = self._gyro_update(new, body, gyro, free[2], tick)
+        new = self._bias_at_rest(new, gyro, self._yaw_rate_then(new, free[2]))
         begun, ended = jnp.concatenate([jnp.zeros(1), new.pose, free[2:]]), new.far[None]
         entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
@@ -243,17 +248,20 @@ class PoseFilter(eqx.Module):
             gyro = (twist + slope nuisance)_yaw + bias + noise
 
         The noise is the gyro's noise plus the model's process noise, whose std grows with the root
-        of the path length. A reading far from the expected value has less weight, and so has every
-        reading while wheels accelerate, since the equilibrium neglects inertia. Only heading and
-        bias are updated; the errors of the model contribute to the variance but keep their values
-        (Schmidt 1966), since the gyro has already been used for the belief about floors.
+        of the path length, and an error that lasts (`LASTING_ERROR`), taken for process noise of
+        the same effect. Otherwise floors that no run showed would teach a wrong bias. A reading far
+        from the expected value has less weight, and so has every reading while wheels accelerate,
+        since the equilibrium neglects inertia. Only heading and bias are updated; the errors of the
+        model contribute to the variance but keep their values (Schmidt 1966), since the gyro has
+        already been used for the belief about floors.
         """
         dt, cov = jnp.maximum(tick.dt, 1e-3), now.covariance
         look = jnp.concatenate([jnp.zeros(3), body.slope[2], jnp.ones(1)])
         usable = (body.speed > CREEP_SPEED) & jnp.isfinite(gyro) & (tick.dt > 0)
         then = self._yaw_rate_then(now, free)
         gap = jnp.where(usable, gyro - now.nuisance[-1] - then, 0.0)
-        walk = (body.share @ self.robot.process[:, 2] ** 2) * body.speed / dt
+        lasting = (LASTING_ERROR / self.robot.frame.base) ** 2 * self.settings.doubt_m
+        walk = (body.share @ self.robot.process[:, 2] ** 2 + lasting) * body.speed / dt
         noise = (self.settings.gyro_std**2 + walk) * (
             1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2
         )
@@ -262,14 +270,16 @@ class PoseFilter(eqx.Module):
         learns = usable * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
         return _scalar_update(now, look, gap, var, learns)
 
-    def _bias_at_rest(self, now: PoseState, gyro: Array) -> PoseState:
+    def _bias_at_rest(self, now: PoseState, gyro: Array, free: Array) -> PoseState:
         """Return the state with the gyro's bias updated while the robot rests.
 
-        The bias is not updated if the reading differs from it by more than 3 stds: the robot then
-        probably creeps on an edge or is turned by hand.
+        A robot that rests may still be turned slowly by a controller that follows the drift of the
+        heading, so the yaw rate `free` by its wheels is subtracted [rad/s]. The bias is not updated
+        if the reading differs from it by more than 3 stds: the robot then probably creeps on an
+        edge or is turned by hand.
         """
         cov = now.covariance
-        gap = gyro - now.nuisance[-1]
+        gap = gyro - now.nuisance[-1] - free
         var = cov[-1, -1] + self.settings.gyro_std**2
         rests = jnp.isfinite(gyro) & (now.still > 0.3) & (gap**2 < 9.0 * var)
         look, learns = jnp.zeros(len(cov)).at[-1].set(1.0), jnp.broadcast_to(rests, len(cov))
