@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.controllers import centre_of, control_loop_of
 from slipid.deploy.deploy import actuator_model_of
 from slipid.deploy.export import FORMS, Exported, ExportOptions
 from slipid.deploy.export import export as run
@@ -87,10 +87,10 @@ def drive(
     """
     if not robot.has_controller:
         raise ValueError(NO_CONTROLLER)
-    reference = path_of(path, speed, robot)
+    common = path_of(path, speed, robot)
     floor = twin_floor(robot) if map is None else read_map(Path(map))
     require_known_surfaces(floor, robot, str(map))
-    places = starts(20, floor, reference)
+    places = starts(20, floor, common)
     if controller not in ROWS or not 0 <= start < len(places):
         names = ", ".join(ROWS)
         raise ValueError(
@@ -103,6 +103,7 @@ def drive(
     if row.true_pose:
         plant = TruePosePlant(plant)
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
+    reference = path_of(path, speed, robot, centre_of(row, robot))
     driven = closed_loop.run_closed_loop(
         loop, reference.moved(begin).after_rest(REST_S), plant, begin
     )

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from slipid.deploy.twin_run import turning_centre
 from slipid.parameter import as_numbers
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Correction, Law
@@ -122,10 +123,7 @@ def control_loop_of(
     """
     if obstacle := row.obstacle(robot):
         raise DataError(f"{row.about}: {obstacle}; expected another controller")
-    if row.observer == "encoder" and robot.record.nominal is not None:
-        robot = _rolling_by(robot, np.array(robot.record.nominal))
-    if row.observer == "calibrated":
-        robot = _rolling_by(robot, np.mean(_calibrations(robot), axis=0))
+    robot = _known(row, robot)
     gains = Gains.of(robot) if row.designed else Gains()
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
@@ -137,6 +135,26 @@ def control_loop_of(
     law = None if row.law is None else row.law(robot)
     controller = Controller(robot, gains, correction=row.correction, law=law, recovery=recovery)
     return ControlLoop(estimator, controller)
+
+
+def centre_of(row: ControllerRow, robot: DeployedRobot) -> float:
+    """Return how far ahead of its middle a robot turns on the spot by the row's model [m]."""
+    if robot.holonomic:
+        return 0.0
+    if row.observer == "contact":
+        return turning_centre(robot)
+    known = _known(row, robot)
+    twist = known.inverse @ known.forward[:, 2]
+    return -float(twist[1] / twist[2])
+
+
+def _known(row: ControllerRow, robot: DeployedRobot) -> DeployedRobot:
+    """Return a robot with the lengths by which the row's odometry rolls."""
+    if row.observer == "encoder" and robot.record.nominal is not None:
+        return _rolling_by(robot, np.array(robot.record.nominal))
+    if row.observer == "calibrated":
+        return _rolling_by(robot, np.mean(_calibrations(robot), axis=0))
+    return robot
 
 
 def _calibrations(robot: DeployedRobot) -> list[Rows]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.floor_map import read_map
-from slipid.deploy.controllers import CONTROLLERS, ControllerRow, control_loop_of
+from slipid.deploy.controllers import CONTROLLERS, ControllerRow, centre_of, control_loop_of
 from slipid.deploy.deploy import actuator_model_of
 from slipid.deploy.floors import floor_of
 from slipid.deploy.twin_run import (
@@ -97,12 +97,12 @@ def export(
     """
     row = _checked_row(options, rows)
     check_writable(out)
-    path = path_of(options.path, options.speed, robot)
     floor = twin_floor(robot) if options.map is None else read_map(options.map)
     require_known_surfaces(floor, robot, str(options.map))
+    loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
+    path = path_of(options.path, options.speed, robot, centre_of(row, robot))
     place = starts(20, floor, path)[0]
     start = (0.0, 0.0, 0.0) if options.map is None else place
-    loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
     if options.recovery is not None:
         loop = eqx.tree_at(lambda x: x.controller.recovery, loop, jnp.asarray(options.recovery))
     path = path.moved(start).after_rest(REST_S)

@@ -22,7 +22,7 @@ from slipid.robot.interface import (
     StateEstimate,
 )
 from slipid.robot.supervision import ControllerState
-from slipid.robot.trajectory import Path
+from slipid.robot.trajectory import ROW_PERIOD, Path
 
 DURATION_FACTOR = 2.0
 """Largest duration of a run, as a multiple of the path's duration, to which 10 s are added [1]."""
@@ -256,7 +256,13 @@ def path_metrics(run: ClosedLoopRun) -> PathMetrics:
     sides = np.diff(corners, axis=0)
     sizes = np.hypot(*sides.T)
     at = np.minimum(np.searchsorted(run.path_time, np.asarray(path.marks) - 1e-6), len(p) - 1)
-    along = ((p[at, :2] - corners[1:]) * sides).sum(axis=1) / np.maximum(sizes, 1e-9)
+    marks, rates = np.asarray(path.marks) + 1e-6, np.asarray(path.rows[:, 3:5])
+    moving = np.flatnonzero(np.hypot(*rates.T) > 1e-6)
+    last = moving[np.searchsorted(moving * ROW_PERIOD, marks) - 1] if len(marks) else moving[:0]
+    ways = rates[last] / np.hypot(*rates[last].T)[:, None]
+    if np.hypot(*rates[np.round(marks / ROW_PERIOD).astype(int)].T).max(initial=0.0) > 1e-6:
+        ways = sides / np.maximum(sizes, 1e-9)[:, None]  # quarters of a curve, without stops
+    along = ((p[at, :2] - corners[1:]) * ways).sum(axis=1)
     rows = np.asarray(path.rows[:, :2])
     off = _distance_from_line(p[:, :2], rows[::5] if len(rows) > 5 else rows)
     remaining_mm = 1000 * float(path.remaining(run.path_time[-1]))
@@ -265,7 +271,8 @@ def path_metrics(run: ClosedLoopRun) -> PathMetrics:
     return PathMetrics(
         along_track_mm=tuple((1000 * along).tolist()),
         sides_mm=tuple((1000 * sizes).tolist()),
-        closure_mm=1000 * float(np.hypot(*(p[-1, :2] - corners[-1]))) + remaining_mm,
+        closure_mm=1000 * float(np.hypot(*(p[-1] - np.asarray(path.rows[-1, :3]))[:2]))
+        + remaining_mm,
         cross_track_rmse_mm=1000 * float(np.sqrt((off**2).mean())),
         heading_error_deg=float(turned),
         path_length_mm=1000 * float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum()),

@@ -202,7 +202,9 @@ class Controller(eqx.Module):
 
         Args:
             state: state from `init` or the last step.
-            reference: pose and rates in the world, from `slipid.robot.trajectory.Path.at`.
+            reference: pose and rates in the world, from `follow` or
+                `slipid.robot.trajectory.Path.at`. A robot that cannot drive sideways drives at the
+                velocity along the reference's heading.
             estimate: output of an estimator.
             dt: time since the last step [s].
         """
@@ -359,9 +361,8 @@ class Controller(eqx.Module):
         k = self.gains
         ahead, left = _rotated(gap, -pose[2])
         off = jnp.arctan2(jnp.sin(ref[2] - pose[2]), jnp.cos(ref[2] - pose[2]))
-        # rates are read ahead on the path, so that only the sign is that along the present heading
-        along = ref[3] * jnp.cos(ref[2]) + ref[4] * jnp.sin(ref[2])
-        speed = jnp.where(along < 0, -1.0, 1.0) * jnp.sqrt(ref[3:5] @ ref[3:5] + 1e-18)
+        # a turn moves the middle sideways unless it is the centre of rotation
+        speed = ref[3] * jnp.cos(ref[2]) + ref[4] * jnp.sin(ref[2])
         # beside a resting reference the robot first turns towards it, or away to drive in reverse
         near, far = (m + self._sideways() for m in BESIDE_M)
         aside = jnp.clip((jnp.abs(_rotated(gap, -ref[2])[1]) - near) / (far - near), 0.0, 1.0)

@@ -71,18 +71,22 @@ class Path(eqx.Module):
     ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
         """Return the time of the path one step later, and the reference at the new time.
 
-        The reference consists of the pose at the new time and the rates `preview` [s] later.
+        The reference consists of the pose at the new time and the rates `preview` [s] later, which
+        are relative to the heading of that pose for a robot that cannot drive sideways.
 
         The path slows down, and its rates with it, while the robot's estimated `pose` lags behind
         the reference or is off to the side. A heading that lags counts as the distance that a point
-        at the end of a lever `arm` [m] lags; with 0 headings do not count. The path does not wait
-        for a robot that is ahead, nor for the first `sideways` [m] of a distance to the side. A
-        `dt` [s] that is not a positive number counts as 0; time advances by at most `LONGEST_STEP`.
+        at the end of a lever `arm` [m] lags; with 0, for robots that drive sideways, headings do
+        not count. The path does not wait for a robot that is ahead, nor for the first `sideways`
+        [m] of a distance to the side. A `dt` [s] that is not a positive number counts as 0; time
+        advances by at most `LONGEST_STEP`.
         """
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST_STEP), 0.0)
         here = self.at(time)
         gap, v = here[:2] - pose[:2], here[3:5]
+        ahead = jnp.stack([jnp.cos(here[2]), jnp.sin(here[2])])
+        v = jnp.where(jnp.asarray(arm) > 0, (v @ ahead) * ahead, v)
         size = jnp.sqrt(v @ v + 1e-12)
         along = jnp.where(size > 1e-3, gap @ v / size, 0.0)
         beside = jnp.sqrt(jnp.maximum(gap @ gap - along**2, 0.0) + 1e-12)
@@ -93,8 +97,12 @@ class Path(eqx.Module):
         off = jnp.sqrt(lag + (arm * turn) ** 2 + 1e-12)
         rate = jnp.clip((WAIT_M - off) / (WAIT_M - FULL_SPEED_M), 0.0, 1.0)
         time = jnp.asarray(time) + rate * dt
-        rates = self.at(time + preview)[3:] * rate
-        return time, jnp.concatenate([self.at(time)[:3], rates])
+        here, later = self.at(time), self.at(time + preview)
+        turn = jnp.where(jnp.asarray(arm) > 0, here[2] - later[2], 0.0)
+        c, s = jnp.cos(turn), jnp.sin(turn)
+        v = jnp.stack([c * later[3] - s * later[4], s * later[3] + c * later[4]])
+        rates = rate * jnp.concatenate([v, later[5:]])
+        return time, jnp.concatenate([here[:3], rates])
 
     def moved(self, start: Sequence[float]) -> "Path":
         """Move the path so that it begins at a pose (x, y [m], heading [rad])."""
@@ -245,8 +253,12 @@ def tangent(
     acceleration: float = 0.5,
     pause: float = 0.6,
     yaw_rate: float = 1.6,
+    centre: float = 0.0,
 ) -> Path:
     """Return the path of a robot that does not drive sideways, from the origin, straight ahead.
+
+    The point about which the robot turns follows the shape; it lies `centre` ahead of the middle of
+    the robot, to which the path belongs. A turn moves the middle sideways unless `centre` is 0.
 
     The robot stops before and after a turn on the spot, where it changes between driving ahead and
     in reverse, and at the end; in between the speed changes by a trapezoidal profile. The robot
@@ -260,6 +272,7 @@ def tangent(
         acceleration: acceleration along the path [m/s^2].
         pause: rest at every stop [s].
         yaw_rate: largest yaw rate [rad/s].
+        centre: distance of the centre of rotation ahead of the robot's middle [m].
 
     Raises:
         ValueError: the shape is empty or a section has no length; or the speed, the acceleration or
@@ -287,6 +300,8 @@ def tangent(
     if len(stops) == 1:
         driven = np.cumsum(np.hypot(*np.diff(rows[:, :2], axis=0).T))
         stops = [*np.searchsorted(driven, driven[-1] * np.array([0.25, 0.5, 0.75])) + 1, *stops]
+    c, s, zero = np.cos(rows[:, 2]), np.sin(rows[:, 2]), np.zeros(len(rows))
+    rows -= centre * np.stack([c - 1, s, zero, -s * rows[:, 5], c * rows[:, 5], zero], axis=1)
     marks = np.array(stops, int)
     corners = jnp.asarray(rows[marks, :2])
     return Path(jnp.asarray(rows), jnp.asarray(marks * ROW_PERIOD), corners)

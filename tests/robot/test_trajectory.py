@@ -207,6 +207,18 @@ def test_a_tangent_path_has_the_heading_of_its_motion_and_closes(name):
 
 
 @pytest.mark.parametrize("name", CLOSED)
+def test_the_centre_of_rotation_follows_the_shape_and_the_middle_goes_with_it(name):
+    centre, plain = -0.06, np.asarray(tangent(CLOSED[name]).rows)
+    rows = np.asarray(tangent(CLOSED[name], centre=centre).rows)
+    ahead = np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], axis=1)
+    np.testing.assert_allclose(rows[:, :2] + centre * (ahead - [1, 0]), plain[:, :2], atol=1e-12)
+    moved, rates = slopes(rows)
+    assert np.quantile(np.abs(moved - rates), 0.95, axis=0).max() < 2e-3
+    across = rows[:, 4] * ahead[:, 0] - rows[:, 3] * ahead[:, 1]
+    np.testing.assert_allclose(across, -centre * rows[:, 5], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", CLOSED)
 @pytest.mark.parametrize("yaw_rate", [0.5, 2.0])
 def test_a_tangent_path_keeps_its_limits_and_uses_them(name, yaw_rate):
     rows = np.asarray(tangent(CLOSED[name], 0.3, 0.6, yaw_rate=yaw_rate).rows)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.controllers import centre_of, control_loop_of
 from slipid.deploy.deploy import actuator_model_of, read_robot
 from slipid.deploy.floors import floor_of
 from slipid.deploy.twin_run import (
@@ -68,7 +68,8 @@ class TrialTask:
     Attributes:
         name: name of the run, `CONTROLLER/startNN`.
         row: name of the controller.
-        path: reference path that begins at the origin.
+        path: reference path that begins at the origin; a robot that does not drive sideways turns
+            along it about the point that the row's model says.
         start: pose to which the path is moved and at which the robot starts [m, m, rad].
         seed: seed of all random numbers.
         plant: `testsite` or `twin`.
@@ -191,7 +192,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     }
     write_json(out / "trial.json", content)
     paths = {name: path for name, (_, path) in driven.items()}
-    wanted = np.asarray(tasks[0].path.rows)[:, :2]
+    wanted = np.asarray(tasks[-1].path.rows)[:, :2]
     return TrialResult(content, tuple(runs), paths, wanted, tasks[0].floor)
 
 
@@ -226,10 +227,14 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     )
     # trials with other gains or floors have separate folders, so that their runs stay reusable
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{options.starts}", key)
+    paths = {
+        row: path_of(options.path, options.speed, robot, centre_of(ROWS[row], robot))
+        for row in applicable(options.controllers, robot)
+    }
     shared = options.plant, floor, known_map, robot, site, settings, actuators
     return [
-        TrialTask(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared, kept)
-        for row in applicable(options.controllers, robot)
+        TrialTask(f"{row}/start{k:02d}", row, own, start, 1000 + k, *shared, kept)
+        for row, own in paths.items()
         for k, start in enumerate(starts(options.starts, floor, path))
     ]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from slipid.data.floor_map import four_zones, uniform, write_map
-from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.controllers import centre_of, control_loop_of
 from slipid.deploy.floors import floor_map, floor_of
 from slipid.deploy.twin_run import path_of, starts
 from slipid.lab.testsite.config import plan
@@ -102,6 +102,23 @@ def test_a_robot_that_does_not_drive_sideways_closes_its_paths(pair, name, besid
     assert abs(found.heading_error_deg) < 2
     assert found.cross_track_rmse_mm < (40 if any(beside) else 5)
     assert np.abs(found.along_track_mm).max() < 15
+
+
+@pytest.mark.slow
+def test_a_robot_that_turns_about_a_point_behind_its_middle_closes_the_rectangle(pair):
+    behind, shape = -0.06, reference.SHAPES["rectangle"](1.5)
+    skid = replace(pair, inverse=pair.inverse.at[1].set(-behind * pair.inverse[2]))
+    assert centre_of(ROWS["encoder"], skid) == pytest.approx(behind)
+    assert centre_of(ROWS["contact"], pair) == pytest.approx(0.0, abs=1e-6)
+    loop, found = ControlLoop(Odometry(skid), Controller(skid)), {}
+    for centre in (0.0, behind):
+        path, plant = reference.tangent(shape, centre=centre), Unicycle(skid, delay_s=0.1)
+        course = closed_loop.run_closed_loop(loop, path, plant, (0.0, 0.0, 0.0))
+        found[centre] = closed_loop.path_metrics(course)
+    assert found[0.0].closure_mm > 15  # the last turn moves the middle sideways
+    assert found[behind].finished
+    assert found[behind].closure_mm < 10
+    assert found[behind].cross_track_rmse_mm < 10
 
 
 @pytest.mark.slow
