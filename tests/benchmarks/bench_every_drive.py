@@ -58,6 +58,7 @@ def identified(robot: str, folder: Path) -> tuple[Path, Path]:
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_path_closes(robot, folder):
     config, result = identified(robot, folder)
+    missed = []
     for path in PATHS:
         options = TrialOptions(site=config, controllers=ROWS, path=path, starts=STARTS)
         with Processes(os.cpu_count() or 1) as executor:
@@ -82,6 +83,11 @@ def test_every_path_closes(robot, folder):
             "better than" if better else "worse than" if worse else "not told apart from",
             "calibrated odometry",
         )
-        assert QUICK or with_gyro <= MOST_OF_ENCODERS
-        assert QUICK or not worse
-        assert QUICK or min(row["finished_share"] for row in summary.values()) == 1.0
+        if with_gyro > MOST_OF_ENCODERS:
+            missed.append(f"{path}: {with_gyro:.0%} of encoders' with a gyro")
+        if worse:
+            missed.append(f"{path}: without a gyro worse than calibrated odometry")
+        if min(row["finished_share"] for row in summary.values()) < 1:
+            missed.append(f"{path}: not every run finishes")
+    # said at the end, so that every path is driven
+    assert QUICK or not missed, missed

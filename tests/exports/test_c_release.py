@@ -19,7 +19,7 @@ from slipid.search_space import Choice, Space
 from tests.helpers.compiled_c import NEEDS_COMPILER, CompiledC
 from tests.helpers.kinds import FLOORS, SHAPES, numbers
 from tests.helpers.known_robot import deploy_known
-from tests.helpers.motors_cut import ASKED, CUT, HELD, STALLED, Driven, faults, patterns
+from tests.helpers.motors_cut import ASKED, CUT, HELD, MOST, STALLED, Driven, faults, patterns
 
 pytestmark = [NEEDS_COMPILER, pytest.mark.slow]
 
@@ -81,6 +81,110 @@ void slipid_released(int32_t steps, int32_t with_reference, const int32_t *happe
 }
 """
 """A loop on a body that moves by given kinematics while nobody holds it; outputs of every step."""
+ATTACKED = """
+void slipid_attacked(int32_t rounds, uint64_t seed, const double *most, const double *kinematics,
+                     const double *asked, int32_t *faults, double *share);
+
+static double slipid_draw(uint64_t *seed) {
+  *seed ^= *seed << 13;
+  *seed ^= *seed >> 7;
+  *seed ^= *seed << 17;
+  return (double)(*seed >> 11) / 9007199254740992.0;
+}
+
+void slipid_attacked(int32_t rounds, uint64_t seed, const double *most, const double *kinematics,
+                     const double *asked, int32_t *faults, double *share) {
+  static const double bad[] = {NAN,    INFINITY, -INFINITY, 1e300, -1e300, 1e-310,
+                               0.0,    -1.0,     1e9,       3e7,   50.0};
+  static const double rates[] = {0, 0.05, 0.5, 1};
+  static slipid_state state;
+  slipid_reading in;
+  slipid_estimate out = {.pose = {0}};
+  double angle[SLIPID_DRIVES] = {0}, command[SLIPID_DRIVES] = {0}, before[SLIPID_DRIVES];
+  const double start[3] = {0, 0, 0};
+  slipid_init(&state, start);
+  for (int32_t i = 0; i < 1000 * rounds; ++i) {
+    /* the last ten seconds of every round are honest, the rest is not */
+    const int honest = i % 1000 >= 800, path = (i / 1000) % 2 && !honest;
+    const double rate = honest ? 0 : rates[(int)(4 * slipid_draw(&seed))];
+    double dt = 0.05, twist[3] = {0, 0, 0}, allowed = 0.05;
+    double *field = (double *)&in;
+    slipid_nothing(&in);
+    for (int k = 0; k < SLIPID_DRIVES; ++k) {
+      before[k] = command[k];
+      angle[k] += dt * (honest ? command[k] : 24 * slipid_draw(&seed) - 12);
+      for (int a = 0; a < 3; ++a) {
+        twist[a] += kinematics[SLIPID_DRIVES * a + k] * command[k];
+      }
+    }
+    if (!honest) {
+      for (unsigned k = 0; k < sizeof in / sizeof *field; ++k) {
+        field[k] = 12 * slipid_draw(&seed) - 6;
+      }
+      in.fix_std[0] = 0.05 * slipid_draw(&seed);
+      in.fix_std[1] = 0.05 * slipid_draw(&seed);
+    } else {
+      in.gyro = twist[2];
+    }
+    for (int k = 0; k < SLIPID_DRIVES; ++k) {
+      in.wheel_angle[k] = angle[k];
+      in.current[k] = honest ? 0.5 : in.current[k];
+    }
+    for (unsigned k = 0; k < sizeof in / sizeof *field; ++k) {
+      if (slipid_draw(&seed) < rate) {
+        field[k] = bad[(int)(11 * slipid_draw(&seed))];
+      }
+    }
+    if (!honest && slipid_draw(&seed) < 0.1) {
+      dt = bad[(int)(11 * slipid_draw(&seed))];
+      allowed = isfinite(dt) && dt > 0 ? fmin(dt, 0.5) : 0;
+    }
+    if (honest && state.controller.gave_up) {
+      slipid_rearm(&state.controller);
+    }
+    if (path) {
+      double reference[6];
+      for (int a = 0; a < 6; ++a) {
+        reference[a] = slipid_draw(&seed) < rate ? bad[(int)(11 * slipid_draw(&seed))]
+                                                 : 4 * slipid_draw(&seed) - 2;
+      }
+      slipid_step(&state, &in, reference, dt, &out, command);
+    } else {
+      slipid_drive(&state, &in, asked, dt, &out, command);
+    }
+    int stops = 1, finite = 1;
+    for (int k = 0; k < SLIPID_DRIVES; ++k) {
+      stops = stops && fabs(command[k]) <= fabs(before[k]);
+      finite = finite && isfinite(command[k]);
+      faults[1] += fabs(command[k]) > most[0] + 1e-9;
+    }
+    /* a stop makes progress even without a clock */
+    allowed = stops ? fmax(allowed, 0.01) : allowed;
+    for (int k = 0; k < SLIPID_DRIVES && i > 0; ++k) {
+      faults[2] += fabs(command[k] - before[k]) > most[1] * allowed + 1e-9;
+    }
+    for (int a = 0; a < 3; ++a) {
+      finite = finite && isfinite(out.pose[a]) && isfinite(out.twist[a]);
+      for (int b = 0; b < 3; ++b) {
+        finite = finite && isfinite(out.covariance[3 * a + b]);
+        const double gap = out.covariance[3 * a + b] - out.covariance[3 * b + a];
+        faults[3] += fabs(gap) > 1e-9 * (1 + fabs(out.covariance[3 * a + b]));
+      }
+      faults[3] += !(out.covariance[4 * a] >= 0);
+    }
+    faults[0] += !finite;
+    if (i % 1000 == 999) {
+      share[2 * (i / 1000)] = hypot(twist[0], twist[1]) / hypot(asked[0], asked[1]);
+      share[2 * (i / 1000) + 1] = twist[2] / asked[2];
+    }
+  }
+}
+"""
+"""A loop whose readings, clock and references lie for 800 steps of every 1000, in both modes.
+
+It counts faults of each kind, and gives body speed and yaw rate over those demanded at the end of
+each round."""
+FAULTS = ("not finite", "wheel speed", "acceleration", "covariance")
 
 
 def robot_of(kind: str) -> DeployedRobot:
@@ -95,7 +199,7 @@ def compiled(request, tmp_path_factory) -> CompiledC:
     robot = robot_of(request.param)
     loop = ControlLoop(Estimator(robot), Controller(robot, Gains(), recovery=True))
     folder = tmp_path_factory.mktemp("c")
-    return CompiledC(Code(robot, loop, rectangle()), folder, more=RELEASED)
+    return CompiledC(Code(robot, loop, rectangle()), folder, more=RELEASED + ATTACKED)
 
 
 def driven(compiled: CompiledC, pattern: np.ndarray, with_reference: bool) -> Driven:
@@ -119,3 +223,22 @@ def test_a_robot_that_was_cut_or_held_drives_on_gently(compiled, with_reference)
     for pattern in patterns((CUT, HELD, STALLED)):
         run = driven(compiled, pattern, with_reference)
         assert faults(run, pattern, radius, limit) == []
+
+
+@pytest.mark.parametrize(
+    "rounds", [250, pytest.param(1000, marks=pytest.mark.nightly)], ids=["quarter", "million"]
+)
+def test_nothing_that_is_read_makes_it_unsafe(compiled, rounds):
+    """Over the four drives these are a million steps, nightly a million for each."""
+    robot, limits = compiled.code.robot, compiled.code.loop.controller.limits
+    kinematics = np.ascontiguousarray(np.linalg.pinv(np.asarray(robot.inverse_kinematics[0])))
+    limit = float(limits.acceleration) / float(robot.frame.radius)
+    most = np.array([float(limits.wheel_speed), limit])
+    counts, shares = np.zeros(len(FAULTS), np.int32), np.zeros((rounds, 2))
+    arrays = [a.ctypes.data_as(ctypes.c_void_p) for a in (most, kinematics, ASKED, counts, shares)]
+    compiled.library.slipid_attacked(ctypes.c_int32(rounds), ctypes.c_uint64(20), *arrays)
+    assert dict(zip(FAULTS, counts.tolist(), strict=True)) == dict.fromkeys(FAULTS, 0)
+    # ten honest seconds later it drives as asked
+    assert shares[:, 0].min() > 0.8, shares.min(axis=0)
+    assert shares[:, 1].min() > 0.5, shares.min(axis=0)
+    assert shares.max() < MOST, shares.max(axis=0)
