@@ -43,7 +43,7 @@ CREEP_SPEED = 0.05
 """Speed below which a gyro's difference from the contact model is not used, since fitted runs are
 faster and the model is not known there [m/s]."""
 
-LASTING_ERROR = 0.01
+LASTING_ERROR = 0.004
 """Std of an error of the model that lasts over `Settings.doubt_m`, such as while wheels cross the
 edges of floors, as a fraction of the rim speed [1]."""
 
