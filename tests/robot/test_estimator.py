@@ -483,6 +483,19 @@ def test_a_robot_that_starts_at_once_learns_its_gyro_bias_from_the_contact_model
 
 
 @pytest.mark.slow
+def test_an_error_of_the_model_on_one_patch_is_not_taken_for_the_bias():
+    """The model's yaw rate is off by half a per cent of the rim speed for half a metre."""
+    one = robot().on("b")
+    est, there = Estimator(one), FloorFilter(one, Settings())
+    state, run, speed, off = est.init(), stepped(est), wheels([0.2, 0.0, 0.0]), 0.008
+    twist, amps = partial(solve, there)(jnp.zeros((1, 3)), speed)
+    z = reading(wheel_speed=speed, current=jnp.abs(amps[0]), gyro=float(twist[0, 2]) + off)
+    for _ in range(50):
+        state, _ = run(state, z, DT)
+    assert abs(float(state.place.nuisance[-1])) < 0.5 * off
+
+
+@pytest.mark.slow
 def test_a_late_gyro_is_taken_for_its_own_time():
     late = 3
     est, run = watch(Settings(gyro_delay_s=late * DT))

@@ -206,6 +206,18 @@ def test_a_tangent_path_has_the_heading_of_its_motion_and_closes(name):
     assert rows[-1, 2] == pytest.approx(gone[2], abs=0.02)
 
 
+def test_a_turn_does_not_wait_for_a_robot_that_it_moves_further_aside():
+    """The floor under a skid steer decides how far a turn moves its middle."""
+    path, time = tangent([Turn(-3.0)], centre=0.04), jnp.asarray(1.0)
+    here = path.at(time)
+    aside = here[3:5] / jnp.sqrt(here[3:5] @ here[3:5])
+    pose = here[:3].at[:2].add(-0.12 * aside)
+    after, _ = path.follow(time, pose, 0.05, arm=0.2, sideways=0.13)
+    assert float(after) == pytest.approx(1.05)
+    after, _ = path.follow(time, pose, 0.05, arm=0.2)
+    assert float(after) < 1.01
+
+
 @pytest.mark.parametrize("name", CLOSED)
 def test_the_centre_of_rotation_follows_the_shape_and_the_middle_goes_with_it(name):
     centre, plain = -0.06, np.asarray(tangent(CLOSED[name]).rows)
