@@ -7,9 +7,8 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from slipid.deploy.twin_run import turning_centre
 from slipid.parameter import as_numbers
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Correction, Law
@@ -138,14 +137,29 @@ def control_loop_of(
 
 
 def centre_of(row: ControllerRow, robot: DeployedRobot) -> float:
-    """Return how far ahead of its middle a robot turns on the spot by the row's model [m]."""
+    """Return how far ahead of its middle a robot turns on the spot by the row's model [m].
+
+    For the contact estimator it is the mean over the floors that were driven on, by the model that
+    was selected for each.
+    """
     if robot.holonomic:
         return 0.0
-    if row.observer == "contact":
-        return turning_centre(robot)
     known = _known(row, robot)
-    twist = known.inverse @ known.forward[:, 2]
-    return -float(twist[1] / twist[2])
+    speed = known.forward[:, 2] / known.frame.radius
+    if row.observer == "contact":
+        driven = np.flatnonzero(~np.array(robot.unseen)).tolist()
+        twists = [_twist_on(robot, k, speed) for k in driven]
+    else:
+        twists = [known.inverse @ (known.frame.radius * speed)]
+    return float(np.mean([-twist[1] / twist[2] for twist in twists]))
+
+
+def _twist_on(robot: DeployedRobot, floor: int, speed: Array) -> Array:
+    """Return the twist at wheel speeds of the drives [rad/s], with all wheels on one floor."""
+    if robot.calibrated[floor]:
+        return robot.kinematics[floor] @ speed
+    under = jnp.full(robot.wheels, floor)
+    return robot.standing(under).twist(robot.at_wheels(speed))
 
 
 def _known(row: ControllerRow, robot: DeployedRobot) -> DeployedRobot:

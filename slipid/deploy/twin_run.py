@@ -83,17 +83,15 @@ def path_scale(robot: DeployedRobot) -> float:
     return max(1.0, round(2 * float(robot.frame.base) / trajectory.BASE_M) / 2)
 
 
-def path_of(
-    name: str, speed: float, robot: DeployedRobot, centre: float | None = None
-) -> trajectory.Path:
+def path_of(name: str, speed: float, robot: DeployedRobot, centre: float = 0.0) -> trajectory.Path:
     """Return the path called `name`, which begins at the origin, for a speed [m/s].
 
     A robot that does not drive sideways gets a path that it can follow: the heading is tangent to
-    the path of the point about which it turns, which lies `centre` [m] ahead of its middle; None
-    for that of the deployed model, see `turning_centre`. The rims of its wheels move at about
-    `speed` in turns on the spot. Its yaw rate stays within the robot's limit, and its acceleration
-    within half of the limit, so that the controller has the other half for corrections. Lengths are
-    multiplied by `path_scale`.
+    the path of the point about which it turns, which lies `centre` [m] ahead of its middle, see
+    `slipid.deploy.controllers.centre_of`. The rims of its wheels move at about `speed` in turns on
+    the spot. Its yaw rate stays within the robot's limit, and its acceleration within half of the
+    limit, so that the controller has the other half for corrections. Lengths are multiplied by
+    `path_scale`.
 
     Raises:
         DataError: there is no such path for this robot, or the speed exceeds the robot's limit or
@@ -121,25 +119,8 @@ def path_of(
         speed,
         acceleration,
         yaw_rate=yaw_rate,
-        centre=turning_centre(robot) if centre is None else centre,
+        centre=centre,
     )
-
-
-def turning_centre(robot: DeployedRobot) -> float:
-    """Return how far ahead of its middle a robot turns on the spot [m].
-
-    It is the mean over the floors that were driven on, by the model that was selected for each.
-    """
-    speed = robot.forward[:, 2] / robot.frame.radius
-    of_wheels = robot.at_wheels(speed)
-    centres = []
-    for k in np.flatnonzero(~np.array(robot.unseen)).tolist():
-        if robot.calibrated[k]:
-            twist = robot.kinematics[k] @ speed
-        else:
-            twist = robot.standing(jnp.full(robot.wheels, k)).twist(of_wheels)
-        centres.append(-float(twist[1] / twist[2]))
-    return float(np.mean(centres))
 
 
 def twin_plant(

@@ -22,7 +22,7 @@ from slipid.robot.interface import (
     StateEstimate,
 )
 from slipid.robot.supervision import ControllerState
-from slipid.robot.trajectory import ROW_PERIOD, Path
+from slipid.robot.trajectory import Path
 
 DURATION_FACTOR = 2.0
 """Largest duration of a run, as a multiple of the path's duration, to which 10 s are added [1]."""
@@ -219,9 +219,9 @@ class PathMetrics:
     """Errors of a closed-loop run along its path, computed from true poses.
 
     Attributes:
-        along_track_mm: error along the direction of travel at the end of every side of a polygon or
-            quarter of a curve, positive if the robot went too far [mm].
-        sides_mm: straight length of each side, or distance between the ends of each quarter [mm].
+        along_track_mm: error at the end of every side of a polygon or quarter of a curve, along the
+            line from the end of the one before, positive if the robot went too far [mm].
+        sides_mm: distance between the ends of consecutive sides or quarters [mm].
         closure_mm: distance from the last pose to the end of the path, plus the path length that
             remained if the controller gave up [mm].
         cross_track_rmse_mm: root mean square over time of the distance from the path [mm].
@@ -256,13 +256,7 @@ def path_metrics(run: ClosedLoopRun) -> PathMetrics:
     sides = np.diff(corners, axis=0)
     sizes = np.hypot(*sides.T)
     at = np.minimum(np.searchsorted(run.path_time, np.asarray(path.marks) - 1e-6), len(p) - 1)
-    marks, rates = np.asarray(path.marks) + 1e-6, np.asarray(path.rows[:, 3:5])
-    moving = np.flatnonzero(np.hypot(*rates.T) > 1e-6)
-    last = moving[np.searchsorted(moving * ROW_PERIOD, marks) - 1] if len(marks) else moving[:0]
-    ways = rates[last] / np.hypot(*rates[last].T)[:, None]
-    if np.hypot(*rates[np.round(marks / ROW_PERIOD).astype(int)].T).max(initial=0.0) > 1e-6:
-        ways = sides / np.maximum(sizes, 1e-9)[:, None]  # quarters of a curve, without stops
-    along = ((p[at, :2] - corners[1:]) * ways).sum(axis=1)
+    along = ((p[at, :2] - corners[1:]) * sides).sum(axis=1) / np.maximum(sizes, 1e-9)
     rows = np.asarray(path.rows[:, :2])
     off = _distance_from_line(p[:, :2], rows[::5] if len(rows) > 5 else rows)
     remaining_mm = 1000 * float(path.remaining(run.path_time[-1]))
@@ -271,8 +265,7 @@ def path_metrics(run: ClosedLoopRun) -> PathMetrics:
     return PathMetrics(
         along_track_mm=tuple((1000 * along).tolist()),
         sides_mm=tuple((1000 * sizes).tolist()),
-        closure_mm=1000 * float(np.hypot(*(p[-1] - np.asarray(path.rows[-1, :3]))[:2]))
-        + remaining_mm,
+        closure_mm=1000 * float(np.hypot(*(p[-1, :2] - rows[-1]))) + remaining_mm,
         cross_track_rmse_mm=1000 * float(np.sqrt((off**2).mean())),
         heading_error_deg=float(turned),
         path_length_mm=1000 * float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum()),
