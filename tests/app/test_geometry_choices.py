@@ -1,4 +1,4 @@
-"""What a calibration frees in a fit of the force balance."""
+"""Parameters that a fit of the force balance frees after a calibration."""
 
 import numpy as np
 import pytest

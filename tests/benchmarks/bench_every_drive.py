@@ -89,5 +89,5 @@ def test_every_path_closes(robot, folder):
             missed.append(f"{path}: without a gyro worse than calibrated odometry")
         if min(row["finished_share"] for row in summary.values()) < 1:
             missed.append(f"{path}: not every run finishes")
-    # said at the end, so that every path is driven
+    # checked at the end, so that every path is driven
     assert QUICK or not missed, missed

@@ -458,15 +458,15 @@ def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
     floors, rim, rest = cases("ordinary", 2000, g, seed=7)
     frame = g.frame()
     xi = solve(rim, frame, floors, rest)
-    felt = forces(xi, rim, frame, floors, rest)
+    found = forces(xi, rim, frame, floors, rest)
     solved = np.asarray(
-        (gap(xi, rim, frame, floors, rest) < 1e-9) & (np.asarray(felt.load) > 0).all(axis=1)
+        (gap(xi, rim, frame, floors, rest) < 1e-9) & (np.asarray(found.load) > 0).all(axis=1)
     )
     assert solved.mean() > 0.98
     drive_share, through = np.asarray(frame.drive_share), np.asarray(frame.roller_share)
     along = np.asarray(xi) @ np.asarray(frame.hold).T
     roll = np.asarray(xi) @ np.asarray(frame.roll).T
-    traction, drag = np.asarray(felt.traction), np.asarray(felt.drag)
+    traction, drag = np.asarray(found.traction), np.asarray(found.drag)
     radius = np.exp(np.asarray(frame.grip) * np.asarray(floors.rolling_radius)[:, None])
     rim = np.asarray(rim) * radius
     held = (
@@ -480,7 +480,7 @@ def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
     rolling = (
         np.asarray(floors.rolling_resistance)[:, None]
         * even ** (np.asarray(floors.drag_exponent)[:, None] - 1)
-        * np.asarray(felt.load)
+        * np.asarray(found.load)
         * np.tanh(along / (V0 + S1 * active))
         * along
     )
