@@ -75,7 +75,7 @@ def _paths_panel(axes: Axes, name: str, trial: TrialResult, one: int) -> None:
     The path from start `one` is highlighted, over the floor as seen from that start.
     """
     runs = [r for r in trial.content["runs"] if r["controller"] == name]
-    wanted, floor = trial.wanted, trial.floor
+    wanted, floor = trial.wanted[name], trial.floor
     own = [
         (trial.paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _rotation(r["start"][2])
         for k, r in enumerate(runs)

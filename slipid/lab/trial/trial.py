@@ -135,14 +135,15 @@ class TrialResult:
         content: content of trial.json.
         runs: runs that the content summarises.
         paths: true poses (step, 3) of every run, keyed by the run's name.
-        wanted: positions (row, 2) on the reference path that begins at the origin [m].
+        wanted: positions (row, 2) on the reference path that begins at the origin, keyed by
+            controller [m].
         floor: map of the floor on which the robot drove.
     """
 
     content: dict[str, Any]
     runs: tuple[TrialRun, ...]
     paths: Mapping[str, np.ndarray]
-    wanted: np.ndarray
+    wanted: Mapping[str, np.ndarray]
     floor: FloorMap
 
 
@@ -192,7 +193,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     }
     write_json(out / "trial.json", content)
     paths = {name: path for name, (_, path) in driven.items()}
-    wanted = np.asarray(tasks[-1].path.rows)[:, :2]
+    wanted = {task.row: np.asarray(task.path.rows)[:, :2] for task in tasks}
     return TrialResult(content, tuple(runs), paths, wanted, tasks[0].floor)
 
 
