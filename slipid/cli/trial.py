@@ -52,6 +52,10 @@ def trial(
     ] = "rectangle",
     speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Number of start poses.")] = 20,
+    rest: Annotated[
+        float,
+        option("S", "Rest before the robot drives, in which a gyro's bias is found, in seconds."),
+    ] = 1.0,
     load: Load = None,
     jobs: Jobs = None,
     json: Json = None,
@@ -76,6 +80,7 @@ def trial(
         path=path,
         speed=speed,
         starts=starts,
+        rest=rest,
         load=load,
     )
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:

@@ -189,10 +189,13 @@ class Friction(eqx.Module):
 
     def _top_slope(self) -> Array:
         """Return top (1 - tanh^2(m / onset)), the slope of the saturating term times the onset."""
-        return self.top * (1 - jnp.tanh(self._size() / self.onset) ** 2)
+        size = self._size()
+        if self.beside is None:
+            return self.top * (1 - jnp.tanh(size / self.onset) ** 2)
+        return self.top * (1 - (self._slope() * size) ** 2)
 
     def _size(self) -> Array:
-        """Return the magnitude of the sliding, kept away from zero where it has two components."""
+        """Return the magnitude of sliding, kept away from zero where it has two components."""
         if self.beside is None:
             return self.speed
         return jnp.sqrt(self.speed**2 + self.beside**2 + _STILL**2)
@@ -203,9 +206,8 @@ class Friction(eqx.Module):
 
     def _slope_change(self) -> Array:
         """Return the derivative of `_slope` with respect to m, divided by m."""
-        m = self._size()
-        steep = (1 - jnp.tanh(m / self.onset) ** 2) / self.onset
-        return (steep - self._slope()) / m**2
+        m, slope = self._size(), self._slope()
+        return ((1 - (slope * m) ** 2) / self.onset - slope) / m**2
 
 
 class WheelForces(eqx.Module):

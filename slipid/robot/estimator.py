@@ -131,7 +131,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
             read = jnp.isfinite(z.steering_angle) & (jnp.abs(z.steering_angle) < MOST)
             steering = jnp.where(read, z.steering_angle, steering)
         by_floor, by_pose = FloorFilter(f, s, steering), PoseFilter(f, s)
-        of = by_floor.predict(old.floors, w)
+        of = by_floor.predict(old.floors, w, old.wheels.speed)
         gap = by_pose.gyro_gap(old.place, z.gyro, *by_floor.yaw_rate(old.floors, of, tick), tick)
         checking, checked = check_gyro(old.gyro, z.gyro, *gap, s.gyro_std, dt)
         gyro, before = checked.rate, by_pose.turned(old.place, checked.turn, checked.doubt)

@@ -148,7 +148,7 @@ def rollouts(folder, robots, steps):
     def ours(rims):
         def one(carry, rim):
             twist, pose, sum_ = carry
-            twist, felt = contact.settle(twist, rim, on, f.inverse)
+            twist, felt = contact.settle(twist, rim, rim, on, f.inverse)
             return (twist, move(pose, twist), sum_ + jnp.sum(felt**2, axis=0)), None
 
         start = (jnp.zeros((3, robots)), jnp.zeros((3, robots)), jnp.zeros(robots))
@@ -180,7 +180,7 @@ def rollouts(folder, robots, steps):
     def theirs():
         twist, pose, total = np.zeros((robots, 3)), np.zeros((robots, 3)), np.zeros(robots)
         at = [x.ctypes.data_as(ctypes.c_void_p) for x in (flat, table, pose, twist, total)]
-        counts = (steps, robots, contact.SETTLE_CHORD_STEPS, contact.SETTLE_NEWTON_STEPS)
+        counts = (steps, robots, contact.chord_steps(f.wheels), contact.SETTLE_NEWTON_STEPS)
         rollout(*counts, ctypes.c_double(dt), *at)
         return twist.T, pose.T, total
 

@@ -22,7 +22,8 @@ from slipid.exports.text import template
 from slipid.lab.trial.controllers import ROWS
 from slipid.model import contact
 from slipid.model.contact_balance import stand
-from slipid.model.geometry import mecanum
+from slipid.model.geometry import differential, mecanum
+from slipid.robot import trajectory
 from slipid.robot.filter import hypotheses
 from slipid.robot.filter.hypotheses import hypotheses_of
 from tests.benchmarks.export_builds import (
@@ -31,6 +32,7 @@ from tests.benchmarks.export_builds import (
     KINDS,
     PATH,
     PLAIN,
+    THREE,
     Fleet,
     code,
     driven,
@@ -109,7 +111,7 @@ def settled(folder: Path) -> tuple[int, np.ndarray]:
         names,
         "settled",
         arguments,
-        lambda start, rim: contact.settle(start, rim, on, f.inverse),
+        lambda start, rim: contact.settle(start, rim, rim, on, f.inverse),
     )
     head = [
         "#include <float.h>",
@@ -140,7 +142,7 @@ def test_contact_balance_beside_its_twin(tmp_path):
     (tmp_path / "given").write_bytes(counts.tobytes() + rims.tobytes() + floors.tobytes())
     sizes = [
         f"-DCOMBINATIONS={count}",
-        f"-DCHORDS={contact.SETTLE_CHORD_STEPS}",
+        f"-DCHORDS={contact.chord_steps(f.wheels)}",
         f"-DNEWTONS={contact.SETTLE_NEWTON_STEPS}",
     ]
     twin = f'-DTWIN="{HERE / "twin.c"}"'
@@ -155,6 +157,33 @@ def test_contact_balance_beside_its_twin(tmp_path):
         )
         assert apart < 1e-9
         assert QUICK or ours <= BESIDE * theirs
+
+
+# other drives -----------------------------------------------------------------------------------
+
+
+def test_differential_robot_beside_omni_robot(tmp_path):
+    """Whole steps of the contact controller on two floors, one after the other in turns."""
+    floors, circle = ("firm", "soft"), trajectory.arc(0.35, -12 * np.pi)
+    shapes = {"omni": THREE, "differential": differential(0.2, 0.04)}
+    folders, took = {}, {name: [] for name in shapes}
+    for name, shape in shapes.items():
+        robot = known(shape, floors)
+        path = PATH if robot.holonomic else trajectory.tangent([circle]).after_rest(1.0)
+        made = Code(robot, control_loop_of(robot, ROWS["contact"]), path)
+        fleet = Fleet(made, tmp_path, FAST)
+        drive = driven(made, robot, fleet, 400).write(tmp_path / f"{name}_drive")
+        folders[name] = unfleeted(made, tmp_path / name), drive
+    for _ in range(quick(3, 1)):
+        for name, (folder, drive) in folders.items():
+            took[name].append(timed(folder, drive, FAST).median)
+    omni_ns, other_ns = (float(np.median(took[name])) for name in shapes)
+    print(
+        f"\ntwo floors: omni {omni_ns:.0f} ns a step, differential {other_ns:.0f} ns, "
+        f"ratio {other_ns / omni_ns:.2f}",
+        end="",
+    )
+    assert QUICK or other_ns <= omni_ns
 
 
 # many wheels and floors --------------------------------------------------------------------------

@@ -29,6 +29,8 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers import small_twin
 from tests.helpers.compiled_c import NEEDS_COMPILER
+from tests.helpers.kinds import SHAPES, deployed
+from tests.helpers.shared import invoke
 
 ROBOT = small_twin.deployed(1.0, 1.0, 0.3)
 QUIET = Reporter(quiet=True)
@@ -72,6 +74,36 @@ def test_its_example_drives_as_the_library_did(folder, tmp_path):
     lines = (here / "examples/drive/commands.txt").read_text().splitlines()
     assert len(lines) > 300
     assert float(lines[-1].split()[-1]) == pytest.approx(rectangle().duration + REST_S, abs=0.05)
+
+
+@pytest.mark.slow
+@NEEDS_COMPILER
+@pytest.mark.parametrize(
+    "kind",
+    [k if k == "differential" else pytest.param(k, marks=pytest.mark.nightly) for k in SHAPES],
+)
+def test_every_drive_is_tried_and_exported_from_the_command_line(kind, tmp_path):
+    """A trial on the twin, all forms of an export, and its self-test in C."""
+    deployed(kind).save(tmp_path / "robot.json")
+    words = ("--plant", "twin", "--path", "circle", "--starts", 1, "--jobs", 1, "--quiet")
+    done = invoke("trial", tmp_path, "--controllers", "contact", *words)
+    assert done.exit_code == 0, done.output
+    found = json.loads((tmp_path / "trial.json").read_text())
+    assert found["summary"]["contact"]["finished_share"] == 1
+    words = ("export", tmp_path, "--path", "circle", "--out", tmp_path / "to_go", "--quiet")
+    done = invoke(*words)
+    assert done.exit_code == 0, done.output
+    assert invoke("export", tmp_path / "to_go", "--check").exit_code == 0
+    result = subprocess.run(
+        "cc -O2 -Isrc -o check test/check.c src/slipid.c -lm && ./check",
+        shell=True,
+        cwd=tmp_path / "to_go/c",
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    forms = {path.name for path in (tmp_path / "to_go").iterdir() if path.is_dir()}
+    assert forms == set(FORMS)
 
 
 @pytest.mark.slow

@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 
 from slipid.exports.c99.code import Code
-from slipid.model.robot import build
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller
-from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.robot.gains import Gains
 from slipid.robot.trajectory import rectangle
-from slipid.search_space import Choice, Space
 from tests.helpers.compiled_c import NEEDS_COMPILER, CompiledC
-from tests.helpers.kinds import FLOORS, SHAPES, numbers
-from tests.helpers.known_robot import deploy_known
+from tests.helpers.kinds import SHAPES, deployed
 from tests.helpers.motors_cut import ASKED, CUT, HELD, MOST, STALLED, Driven, faults, patterns
 
 pytestmark = [NEEDS_COMPILER, pytest.mark.slow]
@@ -187,16 +183,9 @@ each round."""
 FAULTS = ("not finite", "wheel speed", "acceleration", "covariance")
 
 
-def robot_of(kind: str) -> DeployedRobot:
-    shape = SHAPES[kind]
-    robot = build(shape, list(FLOORS), ("as_built",), ("today",))
-    choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
-    return deploy_known(Space(robot, choices).template)
-
-
 @pytest.fixture(scope="module", params=list(SHAPES))
 def compiled(request, tmp_path_factory) -> CompiledC:
-    robot = robot_of(request.param)
+    robot = deployed(request.param)
     loop = ControlLoop(Estimator(robot), Controller(robot, Gains(), recovery=True))
     folder = tmp_path_factory.mktemp("c")
     return CompiledC(Code(robot, loop, rectangle()), folder, more=RELEASED + ATTACKED)

@@ -17,7 +17,9 @@ from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_lo
 from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
 from slipid.model.robot import Robot, build
 from slipid.parameter import entries
+from slipid.robot.deployed import DeployedRobot
 from slipid.search_space import Choice, Space
+from tests.helpers.known_robot import deploy_known
 
 SHAPES = {
     "omni 4": omni([45.0, 135.0, 225.0, 315.0], 0.2, 0.05, 16.0),
@@ -54,6 +56,13 @@ def known(shape: Geometry, drives: Sequence[PlannedRun]) -> Robot:
     robot = build(shape, list(FLOORS), ("as_built",), sorted({d.session for d in drives}))
     choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
     return Space(robot, choices).template
+
+
+def deployed(kind: str) -> DeployedRobot:
+    """A robot of some kind for controllers, which knows every number."""
+    robot = build(SHAPES[kind], list(FLOORS), ("as_built",), ("today",))
+    choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
+    return deploy_known(Space(robot, choices).template)
 
 
 def fitted(truth: Robot, data: Runs, choices: Sequence[Choice]) -> Fit:

@@ -90,7 +90,7 @@ def believed(by_pose, after, before):
     none, still = jnp.zeros(3), TimeStep(jnp.asarray(0.05), jnp.zeros((), bool), jnp.zeros(()))
     currents = MotorCurrents(none, jnp.zeros(3, int), jnp.ones(3), jnp.zeros(()))
     begin = by_floor.init()
-    of = by_floor.predict(begin, none)
+    of = by_floor.predict(begin, none, none)
     _, motion = by_floor.step(begin, of, currents, jnp.asarray(jnp.nan), still)
     motion = replace(motion, known=after, before=before)
     root, supports = by_pose.mapped(state, HALVES, hypotheses)

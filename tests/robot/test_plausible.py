@@ -24,8 +24,8 @@ REGION = 11.34
 GYRO, ENCODER, CURRENT, FIX = range(4)
 
 
-def journey(spoil=None, twist=(0.2, 0.05, 0.3), steps=70, at=50, **more):
-    """The estimate of a robot that accelerates and drives, one reading of which is spoilt."""
+def journey(spoil=None, twist=(0.2, 0.05, 0.3), steps=70, at=50, count=1, **more):
+    """The estimate of a robot that accelerates and drives, some readings of which are spoilt."""
     est, run = watch()
     rng, state = np.random.default_rng(1), est.init()
     angle, speed, target = np.zeros(3), np.zeros(3), wheels(twist)
@@ -38,10 +38,10 @@ def journey(spoil=None, twist=(0.2, 0.05, 0.3), steps=70, at=50, **more):
             "current": np.array([0.3, 0.25, 0.35]) + 0.07 * rng.normal(size=3),
             "gyro": twist[2] * share + 0.004 * rng.normal(),
         } | more
-        if spoil is not None and k == at:
+        if spoil is not None and at <= k < at + count:
             z = spoil(z, np.asarray(state.place.pose))
         state, said = run(state, reading(**z), DT)
-        if k == at:
+        if k == at + count - 1:
             then = said
     return then, said
 
@@ -60,11 +60,13 @@ def moved(spoil, believed=False, **more):
     return max(found), np.asarray(wrong.rejected - right.rejected)
 
 
+@pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("rate", [8.0, 30.0, -30.0, 1e4])
-def test_a_wrong_gyro_reading_turns_nothing(rate):
-    far, rejected = moved(lambda z, _: z | {"gyro": rate})
+def test_wrong_gyro_readings_turn_nothing(rate, count):
+    """Even if they agree, for less than the time after which they are believed."""
+    far, rejected = moved(lambda z, _: z | {"gyro": rate}, count=count)
     assert far < 0.05
-    np.testing.assert_array_equal(rejected, [1, 0, 0, 0])
+    np.testing.assert_array_equal(rejected, [count, 0, 0, 0])
 
 
 @pytest.mark.parametrize("jump", [-100.0, -1.0, -0.4, 0.2, 0.4, 1.0, 7.0])

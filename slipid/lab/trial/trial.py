@@ -58,6 +58,8 @@ FOLDER = "trial"
 """Name of the folder of finished runs, in the result folder."""
 SAME_PLACE = 0.2
 """Largest distance of a wheel of the test site's robot from that of the fit, in base radii [1]."""
+MOST_REST_S = 60.0
+"""Longest rest before a robot drives [s]."""
 PLANTS = ("testsite", "twin")
 
 
@@ -71,6 +73,7 @@ class TrialTask:
         path: reference path that begins at the origin; a robot that does not drive sideways turns
             along it about the point that the row's model says.
         start: pose to which the path is moved and at which the robot starts [m, m, rad].
+        rest: rest before the robot drives [s].
         seed: seed of all random numbers.
         plant: `testsite` or `twin`.
         floor: map of the floor on which the robot drives.
@@ -86,6 +89,7 @@ class TrialTask:
     row: str
     path: trajectory.Path
     start: tuple[float, float, float]
+    rest: float
     seed: int
     plant: str
     floor: FloorMap
@@ -113,6 +117,7 @@ class TrialOptions:
         path: name of the path, see `path_of`.
         speed: speed along the path [m/s].
         starts: number of starts.
+        rest: rest before the robot drives, during which the estimator finds the gyro's bias [s].
         load: name of the load set-up; None for the first.
     """
 
@@ -124,6 +129,7 @@ class TrialOptions:
     path: str = "rectangle"
     speed: float = 0.2
     starts: int = 20
+    rest: float = REST_S
     load: str | None = None
 
 
@@ -183,6 +189,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
         "told_map": None if options.told_map is None else str(options.told_map),
         "path": options.path,
         "speed_m_s": options.speed,
+        "rest_s": options.rest,
         "gains": _gains(tasks[0].robot),
         "closes_best": None if len(best) > 1 else best[0],
         "not_told_apart": best,
@@ -203,6 +210,8 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     unknown = [f" '{name}'" for name in options.controllers if name not in ROWS]
     if unknown or not options.controllers:
         raise DataError(f"no controller{''.join(unknown[:1])}; expected one of {', '.join(ROWS)}")
+    if not 0 <= options.rest <= MOST_REST_S:
+        raise DataError(f"rest {options.rest:g} s; expected 0 to {MOST_REST_S:g} s")
     robot = jax.tree.map(np.asarray, read_robot(out, options.load))
     path = path_of(options.path, options.speed, robot)
     floor = twin_floor(robot) if options.map is None else read_map(options.map)
@@ -219,7 +228,7 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     if options.told_map is not None:
         require_known_surfaces(known_map, robot, str(options.told_map))
     gains = _gains(robot)
-    about = options.plant, options.path, options.speed, robot.load_setup, gains
+    about = options.plant, options.path, options.speed, options.rest, robot.load_setup, gains
     key = key_of(
         *(*about, json.dumps(site.to_json()), settings, actuators, *jax.tree.leaves(robot)),
         *(part for m in (floor, known_map) for part in (m.surfaces, m.corner, m.cell, m.cells)),
@@ -234,7 +243,7 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     }
     shared = options.plant, floor, known_map, robot, site, settings, actuators
     return [
-        TrialTask(f"{row}/start{k:02d}", row, own, start, 1000 + k, *shared, kept)
+        TrialTask(f"{row}/start{k:02d}", row, own, start, options.rest, 1000 + k, *shared, kept)
         for row, own in paths.items()
         for k, start in enumerate(starts(options.starts, floor, path))
     ]
@@ -256,7 +265,7 @@ def drive(task: TrialTask) -> None:
     setup_jax(quiet=True)
     row = ROWS[task.row]
     robot = jax.tree.map(jnp.asarray, task.robot)
-    path = task.path.moved(task.start).after_rest(REST_S)
+    path = task.path.moved(task.start).after_rest(task.rest)
     plant: closed_loop.Plant
     if task.plant == "twin":
         truth = drawn_robot(robot, task.seed)

@@ -175,10 +175,15 @@ class FloorFilter(eqx.Module):
         )
         return weight / jnp.sum(weight)
 
-    def predict(self, old: FloorState, w: Float[Array, " drive"]) -> Prediction:
-        """Return the predictions of every hypothesis at the wheel speeds `w` [rad/s]."""
-        settled, amps = self.solve(old.twist, w)
+    def predict(
+        self, old: FloorState, w: Float[Array, " drive"], before: Float[Array, " drive"]
+    ) -> Prediction:
+        """Return the predictions of every hypothesis at the wheel speeds `w` [rad/s].
+
+        `before` are the wheel speeds of the last step [rad/s].
+        """
         f, hypotheses = self.robot, hypotheses_of(self.robot)
+        settled, amps = self.solve(old.twist, before, w)
         rolling = f.inverse @ (f.frame.radius * w)
         if f.steering is not None:
             rolling = settled[hypotheses.uniform[0]]
@@ -272,19 +277,23 @@ class FloorFilter(eqx.Module):
         return jnp.sqrt(1 - share[:, None] * (1 - part**2))
 
     def solve(
-        self, near: Float[Array, "hypothesis 3"], w: Float[Array, " drive"]
+        self,
+        near: Float[Array, "hypothesis 3"],
+        before: Float[Array, " drive"],
+        w: Float[Array, " drive"],
     ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis drive"]]:
         """Return twist [m/s, m/s, rad/s] and currents [A] of every hypothesis.
 
-        `w` are the wheel speeds [rad/s]; the iteration starts from `near`, the last step's twists.
+        `w` are the wheel speeds [rad/s]. The iteration starts from the twists `near` of the last
+        step, whose wheel speeds are `before`.
         """
         f = self.robot
         if f.steering is not None:
             twists = self._steered(w)
             return twists, jnp.zeros((len(twists), f.drives))
         on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
-        rim = f.frame.radius * f.at_wheels(w)
-        twist, pull = settle(near.T, rim, on, f.by_wheels)
+        rim, past = (f.frame.radius * f.at_wheels(x) for x in (w, before))
+        twist, pull = settle(near.T, past, rim, on, f.by_wheels)
         drag = Balance(rim[:, None], on).at(Planar(*twist)).rolling_drag
         opposing = f.motor.opposing_force(jnp.stack([pull, drag], axis=-1))
         force = on.friction * f.mass * GRAVITY * opposing

@@ -327,8 +327,8 @@ def test_a_robot_can_be_restricted_to_some_floors(deployed):
     rim = jnp.asarray([3.0, -5.0, 2.0])
     assert only.record.labels == (b,)
     assert not any(path.startswith(f"surface.{a}") for path in only.record.parameters)
-    alone, _ = FloorFilter(only, Settings()).solve(jnp.zeros((1, 3)), rim)
-    every, _ = FloorFilter(deployed, Settings()).solve(jnp.zeros((8, 3)), rim)
+    alone, _ = FloorFilter(only, Settings()).solve(jnp.zeros((1, 3)), 0 * rim, rim)
+    every, _ = FloorFilter(deployed, Settings()).solve(jnp.zeros((8, 3)), 0 * rim, rim)
     np.testing.assert_allclose(alone[0], every[-1], atol=1e-6)
     with pytest.raises(ValueError, match=f"no floor 'ice'; identified: {a}, {b}"):
         deployed.on("ice")
@@ -433,6 +433,9 @@ def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
 def test_impossible_trials_are_refused(tmp_path, deployed, pair):
     with pytest.raises(DataError, match="expected testsite or twin"):
         tr._tasks(tmp_path, tr.TrialOptions(plant="moon"))
+    for rest in (-1.0, 61.0, float("nan")):
+        with pytest.raises(DataError, match="s; expected 0 to 60 s"):
+            tr._tasks(tmp_path, tr.TrialOptions(rest=rest))
     with pytest.raises(DataError, match="no controller 'magic'; expected one of encoder"):
         tr._tasks(tmp_path, tr.TrialOptions(controllers=("magic",)))
     with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
@@ -550,7 +553,8 @@ def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
 
     plain = jobs()[0]
     np.testing.assert_array_equal(plain.path.rows, reference.rectangle().rows)
-    for other in ({"path": "turning"}, {"speed": 0.1}):
+    assert jobs(rest=5.0)[0].rest == 5.0
+    for other in ({"path": "turning"}, {"speed": 0.1}, {"rest": 5.0}):
         job = jobs(**other)[0]
         expected = reference.PATHS[other.get("path", "rectangle")](other.get("speed", 0.2))
         np.testing.assert_array_equal(job.path.rows, expected.rows)
