@@ -55,7 +55,7 @@ def trial(
     rest: Annotated[
         float,
         option("S", "Rest before the robot drives, in which a gyro's bias is found, in seconds."),
-    ] = 1.0,
+    ] = 5.0,
     load: Load = None,
     jobs: Jobs = None,
     json: Json = None,

@@ -15,7 +15,7 @@ from slipid.support.errors import DataError
 
 SITE_SEED, STARTS_SEED = 7, 2021
 """Seeds of the site's patches, and of the start poses."""
-REST_S = 1.0
+REST_S = 5.0
 """Rest before the robot drives, during which the estimator finds the gyro's bias [s]."""
 
 
