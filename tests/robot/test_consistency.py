@@ -93,9 +93,9 @@ def test_a_floor_that_changes_within_a_step_moves_the_pose_by_what_was_travelled
     est = Estimator(robot, sure)
     run = partial(stepped(est), dt=DT)
     w = rolling(robot, (0.2, 0.05, 0.1))
-    near, amps = solve(FloorFilter(robot, sure), jnp.zeros((8, 3)), w)
+    near, amps = solve(FloorFilter(robot, sure), jnp.zeros((8, 3)), w, w)
     for _ in range(5):
-        near, amps = solve(FloorFilter(robot, sure), near, w)
+        near, amps = solve(FloorFilter(robot, sure), near, w, w)
     state = est.init()
     for _ in range(10):
         state, said = run(state, Measurement(wheel_speed=w, current=amps[0]).filled(3))
@@ -152,7 +152,7 @@ def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice(
     run = stepped(est)
     w, near = rolling(robot, (0.2, 0.05, 0.1)), jnp.zeros((8, 3))
     for _ in range(8):  # hypotheses settle
-        near, amps = solve(FloorFilter(robot, sure), near, w)
+        near, amps = solve(FloorFilter(robot, sure), near, w, w)
     state, steps, late = est.init(std=(0.01, 0.02)), 40, 10
     state = eqx.tree_at(lambda s: s.floors.twist, sure_of(state, 0, 8), near)
     for k in range(steps + 3):  # what was taken for the first floor is the second

@@ -30,7 +30,7 @@ def test_drag_along_the_drive_is_in_the_currents_that_tell_floors():
     floors = FloorFilter(known, Settings())
     near = jnp.zeros((8, 3))
     for _ in range(10):
-        near, amps = eqx.filter_jit(floors.solve)(near, w)
+        near, amps = eqx.filter_jit(floors.solve)(near, w, w)
     for k in range(2):
         standing = robot.standing(frame, jnp.asarray(k), jnp.asarray(0))
         xi = standing.twist(w)
@@ -45,7 +45,7 @@ def test_where_frictions_are_open_currents_rule_out_no_mixture_of_floors():
     truth = eqx.tree_at(lambda r: r.floors.friction, robot, jnp.array([0.6, 1.0]))
     near = jnp.zeros((8, 3))
     for _ in range(10):
-        near, amps = eqx.filter_jit(FloorFilter(truth, Settings()).solve)(near, w)
+        near, amps = eqx.filter_jit(FloorFilter(truth, Settings()).solve)(near, w, w)
 
     def believed(covariance):
         known = eqx.tree_at(lambda r: r.friction_covariance, robot, covariance)

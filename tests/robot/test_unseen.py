@@ -152,7 +152,7 @@ def end_after(
     w = truth.forward @ jnp.asarray([0.2 * np.cos(way), 0.2 * np.sin(way), 0.0]) / 0.04
     xi = jnp.zeros((1, 3))
     for _ in range(4):
-        xi, amps = solve(FloorFilter(truth, settings), xi, w)
+        xi, amps = solve(FloorFilter(truth, settings), xi, w, w)
     assert np.isfinite(amps).all()
     return np.asarray(advance(xi[0], 4.0)), np.asarray(
         driven(Estimator(robot, settings), w, amps[0])
