@@ -54,7 +54,7 @@ def trial(
     starts: Annotated[int, typer.Option(min=1, max=99, help="Number of start poses.")] = 20,
     rest: Annotated[
         float,
-        option("S", "Rest before the robot drives, in which a gyro's bias is found, in seconds."),
+        option("S", "Rest before the robot drives, 0 to 60 s, in which a gyro's bias is found."),
     ] = 5.0,
     load: Load = None,
     jobs: Jobs = None,

@@ -33,8 +33,8 @@ _CONVERGED_STEP = 1e-6
 _MOST_NEAR_STEPS = 12
 """Largest number of Newton steps of `root_near`."""
 START_SHARE = 0.8
-"""Twist over the twist without slip at which `root` starts, and by which the starts of `settle`
-follow the wheel speeds [1]."""
+"""Assumed ratio of the twist, or of its change, to that without slip; `root` and `settle` start
+there [1]."""
 SETTLE_NEWTON_STEPS = 2
 """Number of Newton steps of `settle`."""
 
@@ -157,7 +157,7 @@ def _moved(xi: Array, problem: ContactProblem, change: ContactProblem) -> Array:
 
 
 def _start(rim: Float[Array, " wheel"], frame: WheelFrame) -> Float[Array, "3"]:
-    """Return the start of the root finder, from the twist without slip (least squares)."""
+    """Return `START_SHARE` times the twist without slip (least squares), where `root` starts."""
     j = frame.hold
     m = Columns(*(Planar(*column) for column in j.T @ j + 1e-6 * jnp.eye(3)))
     return START_SHARE * jnp.stack(solve3(m, Planar(*(j.T @ (rim * frame.drive_share)))))
@@ -184,10 +184,11 @@ def chord_steps(wheels: int) -> int:
 
     Speeds of more than three wheels can contradict each other, which takes more steps. While wheel
     speeds change by up to 1.25 rad/s per time step on two floors, 99 % of all twists are then
-    within 1e-9 m/s of the equilibrium with two or three wheels, and with four wheels within 0.1
-    mm/s, or 35 mm/s if each of the four turns at random.
+    within 1e-9 m/s of the equilibrium with two or three wheels. With four wheels they are within
+    1e-4 m/s while the wheels turn as one body needs them to, and within 0.03 m/s if each turns
+    independently.
     """
-    return min(max(wheels - 1, 1), 3)
+    return max(wheels - 1, 1) if wheels <= 3 else 4
 
 
 def settle(
@@ -199,14 +200,15 @@ def settle(
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
     """Return the equilibria on many combinations of floors, found from earlier twists.
 
-    A few chord steps are followed by Newton steps, whose result is used if it reduces the residual
-    force; the small fixed number of steps suits the computer of a robot. If the result is not
-    finite, the twist without slip is returned. The error that remains after a jump of the wheel
-    speeds is removed in the following calls.
+    The iteration starts from the last twists plus `START_SHARE` times the change of the twist
+    without slip. A few chord steps are followed by Newton steps, whose result is used if it reduces
+    the residual force; the small fixed number of steps suits the computer of a robot. If the result
+    is not finite, the twist without slip is returned. The error that remains after a jump of the
+    wheel speeds is removed in the following calls.
 
     Args:
-        start: twists of the previous time step, a column for each combination of floors [m/s, m/s,
-            rad/s].
+        start: twists of the previous time step at its rim speeds `before`, a column for each
+            combination of floors [m/s, m/s, rad/s].
         before, rim: rim speeds of the previous time step and of this one, the same on all floors
             (wheel,) or by column (wheel, floors) [m/s].
         on: stance of the robot on each combination of floors, arrays (wheel, floors).

@@ -22,7 +22,7 @@ from slipid.robot.interface import (
     StateEstimate,
 )
 from slipid.robot.supervision import ControllerState
-from slipid.robot.trajectory import Path
+from slipid.robot.trajectory import ROW_PERIOD, Path
 
 DURATION_FACTOR = 2.0
 """Largest duration of a run, as a multiple of the path's duration, to which 10 s are added [1]."""
@@ -229,7 +229,7 @@ class PathMetrics:
         path_length_mm: length of the path that the robot drove, the 2021 paper's metric [mm].
         energy_j: energy used by the motors [J]; None if the plant does not provide it.
         effort: root mean square change of the commanded wheel speeds per period [rad/s].
-        seconds: duration of the run [s].
+        seconds: duration of the run without the rest before the path begins [s].
         finished: True if the path ran to its end within the run.
         recoveries: number of times that the controller began to free a robot that was stuck.
         freed: number of these times after which the robot drove on.
@@ -250,15 +250,21 @@ class PathMetrics:
 
 
 def path_metrics(run: ClosedLoopRun) -> PathMetrics:
-    """Return the errors of a run along its path, computed from true poses."""
-    p, path = run.pose, run.path
+    """Return the errors of a run along its path, computed from true poses.
+
+    Means and the duration are of the rows after the rest with which the path begins.
+    """
+    path, moves = run.path, np.any(np.asarray(run.path.rows[:, 3:]) != 0, axis=1)
+    begins = ROW_PERIOD * max(int(np.argmax(moves)) - 1, 0)
+    first = min(int(np.searchsorted(run.path_time, begins)), len(run.pose) - 2)
+    p = run.pose
     corners = np.vstack([np.asarray(path.rows[0, :2]), np.asarray(path.corners)])
     sides = np.diff(corners, axis=0)
     sizes = np.hypot(*sides.T)
     at = np.minimum(np.searchsorted(run.path_time, np.asarray(path.marks) - 1e-6), len(p) - 1)
     along = ((p[at, :2] - corners[1:]) * sides).sum(axis=1) / np.maximum(sizes, 1e-9)
     rows = np.asarray(path.rows[:, :2])
-    off = _distance_from_line(p[:, :2], rows[::5] if len(rows) > 5 else rows)
+    off = _distance_from_line(p[first:, :2], rows[::5] if len(rows) > 5 else rows)
     remaining_mm = 1000 * float(path.remaining(run.path_time[-1]))
     wanted = float(path.rows[-1, 2])
     turned = np.degrees((p[-1, 2] - wanted + np.pi) % (2 * np.pi) - np.pi)
@@ -270,8 +276,8 @@ def path_metrics(run: ClosedLoopRun) -> PathMetrics:
         heading_error_deg=float(turned),
         path_length_mm=1000 * float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum()),
         energy_j=None if np.isnan(run.energy[-1]) else float(run.energy[-1]),
-        effort=float(np.sqrt((np.diff(run.command, axis=0) ** 2).mean())),
-        seconds=float(run.time[-1]),
+        effort=float(np.sqrt((np.diff(run.command[first:], axis=0) ** 2).mean())),
+        seconds=float(run.time[-1] - run.time[first]),
         finished=bool(run.path_time[-1] >= path.duration - 1e-6),
         recoveries=int(np.sum(np.diff(run.recovering.astype(int), prepend=0) > 0)),
         freed=int(np.sum(np.diff(run.recovering.astype(int)) < 0)),

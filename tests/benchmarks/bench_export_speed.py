@@ -142,7 +142,7 @@ def test_contact_balance_beside_its_twin(tmp_path):
     (tmp_path / "given").write_bytes(counts.tobytes() + rims.tobytes() + floors.tobytes())
     sizes = [
         f"-DCOMBINATIONS={count}",
-        f"-DCHORDS={contact.chord_steps(f.wheels)}",
+        f"-DCHORDS={contact.chord_steps(three_floors().wheels)}",
         f"-DNEWTONS={contact.SETTLE_NEWTON_STEPS}",
     ]
     twin = f'-DTWIN="{HERE / "twin.c"}"'

@@ -154,7 +154,8 @@ def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice(
     for _ in range(8):  # hypotheses settle
         near, amps = solve(FloorFilter(robot, sure), near, w, w)
     state, steps, late = est.init(std=(0.01, 0.02)), 40, 10
-    state = eqx.tree_at(lambda s: s.floors.twist, sure_of(state, 0, 8), near)
+    state = sure_of(state, 0, 8)
+    state = eqx.tree_at(lambda s: (s.floors.twist, s.wheels.speed), state, (near, w))
     for k in range(steps + 3):  # what was taken for the first floor is the second
         z = Measurement(wheel_speed=w, current=amps[0 if k < steps else 7])
         state, said = run(state, z.filled(3), DT)

@@ -466,12 +466,13 @@ def test_heading_is_the_integral_of_a_gyro_without_bias_whatever_is_believed_of_
 def test_a_robot_that_starts_at_once_learns_its_gyro_bias_from_the_contact_model(bias):
     one = robot().on("b")
     est, there = Estimator(one), FloorFilter(one, Settings())
-    state, true, twist = est.init(), 0.0, jnp.zeros((1, 3))
+    state, true, twist, before = est.init(), 0.0, jnp.zeros((1, 3)), jnp.zeros(3)
     turns = partial(solve, there)
     run = stepped(est)
     for k in range(500):
         speed = wheels([0.2 * np.cos(0.01 * k), 0.2 * np.sin(0.01 * k), 0.0])
-        twist, amps = turns(twist, speed, speed)
+        twist, amps = turns(twist, before, speed)
+        before = speed
         rate = float(twist[0, 2])
         true += rate * DT
         z = reading(wheel_speed=speed, current=jnp.abs(amps[0]), gyro=rate + bias)
@@ -488,7 +489,7 @@ def test_an_error_of_the_model_on_one_patch_is_not_taken_for_the_bias():
     one = robot().on("b")
     est, there = Estimator(one), FloorFilter(one, Settings())
     state, run, speed, off = est.init(), stepped(est), wheels([0.2, 0.0, 0.0]), 0.008
-    twist, amps = partial(solve, there)(jnp.zeros((1, 3)), speed, speed)
+    twist, amps = partial(solve, there)(jnp.zeros((1, 3)), 0 * speed, speed)
     z = reading(wheel_speed=speed, current=jnp.abs(amps[0]), gyro=float(twist[0, 2]) + off)
     for _ in range(50):
         state, _ = run(state, z, DT)

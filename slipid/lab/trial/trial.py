@@ -161,7 +161,8 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     Raises:
         DataError: there is no fit in the folder; the plant, a controller, the path, the load set-up
             or a map does not exist; MuJoCo is missing; the test site has another robot; a floor is
-            unknown to the plant or the fit; or the speed is higher than that of any fitted run.
+            unknown to the plant or the fit; the speed is higher than that of any fitted run; or the
+            rest is not 0 to 60 s.
     """
     setup_jax(quiet=True)
     tasks = _tasks(out, options)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from inspect import signature
 from pathlib import Path
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from slipid.cli.trial import trial as command
 from slipid.data.floor_map import four_zones, uniform, write_map
 from slipid.deploy.controllers import centre_of, control_loop_of
 from slipid.deploy.floors import floor_map, floor_of
@@ -153,6 +155,15 @@ def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     assert abs(found.heading_error_deg) < 0.5
     assert found.path_length_mm == pytest.approx(2600, rel=0.03)
     np.testing.assert_allclose(found.sides_mm, [900, 400, 900, 400], atol=1e-6)
+    # a rest before the path begins changes none of them
+    rest = 0.05 * np.arange(40)
+    times = {k: np.append(rest, getattr(course, k) + 2.0) for k in ("time", "path_time")}
+    rows = ("pose", "command", "energy", "recovering")
+    held = {k: np.concatenate([getattr(course, k)[:1]] * 40 + [getattr(course, k)]) for k in rows}
+    later = replace(course, path=path.after_rest(2.0), **times, **held)
+    for name, value in asdict(closed_loop.path_metrics(later)).items():
+        if value is not None:
+            np.testing.assert_allclose(value, getattr(found, name), rtol=1e-6, err_msg=name)
 
 
 @pytest.mark.slow
@@ -553,8 +564,8 @@ def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
 
     plain = jobs()[0]
     np.testing.assert_array_equal(plain.path.rows, reference.rectangle().rows)
-    assert jobs(rest=5.0)[0].rest == 5.0
-    for other in ({"path": "turning"}, {"speed": 0.1}, {"rest": 5.0}):
+    assert signature(command).parameters["rest"].default == tr.TrialOptions().rest
+    for other in ({"path": "turning"}, {"speed": 0.1}, {"rest": 2.0}):
         job = jobs(**other)[0]
         expected = reference.PATHS[other.get("path", "rectangle")](other.get("speed", 0.2))
         np.testing.assert_array_equal(job.path.rows, expected.rows)
@@ -599,6 +610,11 @@ def test_a_controller_can_have_another_map_than_the_true_one(tmp_path, deployed,
     for k, place in enumerate(middle):
         under = floor.under(jnp.array([*place, 0.0]), jnp.zeros((1, 2)))
         assert labels[int(under[0])] == labels[1 - k]
+    rested = []
+    monkeypatch.setattr(reference.Path, "after_rest", lambda path, s: rested.append(s) or path)
+    with pytest.raises(Told):
+        tr.drive(jobs(rest=2.0)[0])
+    assert rested == [2.0]
     with pytest.raises(DataError, match=r"strange\.toml: surface 'moss' was not identified"):
         jobs(told_map=tmp_path / "strange.toml")
 

@@ -42,6 +42,7 @@ from slipid.model.robot import Robot
 from slipid.predict.slip_model import RobotSpec
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, EstimatorState
+from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.interface import Readings, Settings
 from slipid.robot.record import FloorRecord, LoadRecord, RobotRecord, Setting, Wheels
 
@@ -250,9 +251,14 @@ def _beliefs(
         return state, estimate.surface_probability.mean(axis=0)
 
     def one(z: Readings, dt: Array, kind: Array) -> Array:
-        state = estimator.init()
+        state, w = estimator.init(), z.wheel_speed[0]
+        by_floor = FloorFilter(estimator.robot, estimator.settings)
+        twist, _ = by_floor.solve(state.floors.twist, jnp.zeros_like(w), w)
         state = replace(
-            state, wheels=replace(state.wheels, speed=z.wheel_speed[0]), current=z.current[0]
+            state,
+            wheels=replace(state.wheels, speed=w),
+            current=z.current[0],
+            floors=replace(state.floors, twist=twist),
         )
         return jax.lax.scan(step, state, (z, dt, kind))[1]
 
