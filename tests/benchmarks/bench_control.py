@@ -148,8 +148,8 @@ def rollouts(folder, robots, steps):
     def ours(rims):
         def one(carry, rim):
             twist, pose, sum_ = carry
-            twist, felt = contact.settle(twist, rim, rim, on, f.inverse)
-            return (twist, move(pose, twist), sum_ + jnp.sum(felt**2, axis=0)), None
+            twist, pull = contact.settle(twist, rim, rim, on, f.inverse)
+            return (twist, move(pose, twist), sum_ + jnp.sum(pull**2, axis=0)), None
 
         start = (jnp.zeros((3, robots)), jnp.zeros((3, robots)), jnp.zeros(robots))
         return jax.lax.scan(one, start, rims)[0]

@@ -501,10 +501,13 @@ def deployed(out):
     assert "driving 0 of 4 runs" in again.stderr
     assert json.loads((out / "t.json").read_text())["runs"] == said["runs"]
     wish = ("trial", out, "--plant", "twin", "--starts", 1, "--jobs", 1, "--controllers", "contact")
-    circle = invoke(*wish, "--path", "circle", "--speed", 0.1, "--json", out / "t.json")
+    words = ("--path", "circle", "--speed", 0.1, "--rest", 2, "--json", out / "t.json")
+    circle = invoke(*wish, *words)
     assert circle.exit_code == 0, circle.stderr
-    run = json.loads((out / "t.json").read_text())["runs"][0]
-    # once round takes 22 s at 0.1 m/s, after a second's rest
+    said = json.loads((out / "t.json").read_text())
+    run = said["runs"][0]
+    assert said["rest_s"] == 2
+    # once round takes 22 s at 0.1 m/s, without the rest
     assert run["path_length_mm"] == pytest.approx(2 * np.pi * 350, rel=0.25)
     assert 22 < run["seconds"] < 45
 
