@@ -11,7 +11,7 @@ from slipid.infer.result import Fit
 from slipid.model import contact_law as law
 from slipid.model.robot import GRAVITY, Robot
 from slipid.plots import drawing
-from slipid.plots.measured_windows import MeasuredWindows
+from slipid.infer.measured_windows import MeasuredWindows, driving_torque
 from slipid.plots.motion import named
 
 SIDEWAYS_COLOUR = "#35B779"
@@ -70,27 +70,6 @@ def _cloud(ax: Axes, robot: Robot, measured: MeasuredWindows, floor: str) -> Pat
     x, y = torque[turns][order], measured.wheel_slip[turns][order]
     colour = np.minimum(measured.sideways[turns], 2.0)[order]
     return ax.scatter(x, y, 7, colour, lw=0, alpha=0.6, cmap="viridis_r", vmin=0.0, vmax=2.0)
-
-
-def driving_torque(robot: Robot, measured: MeasuredWindows) -> np.ndarray:
-    """Return the traction torque of each drive per wheel, positive along the wheel's motion [N m].
-
-    The torque follows from the measured current; if currents were not logged, it is the predicted
-    one. A current that is logged as a magnitude gets the sign of the prediction.
-    """
-    turning, wheels = np.sign(measured.wheel_speed), robot.geometry.wheels / robot.geometry.drives
-    if measured.amps is None:
-        return measured.torque * turning / wheels
-    speed = np.abs(measured.wheel_speed)
-    amps = measured.amps * turning
-    if measured.unsigned:
-        driven = (
-            (measured.torque + measured.drag_torque) * turning
-            + np.asarray(robot.motor.friction(jnp.asarray(speed)))
-        ) >= 0
-        amps = (measured.amps - float(robot.motor.current_offset)) * np.where(driven, 1.0, -1.0)
-    torque = np.asarray(robot.motor.torque(jnp.asarray(amps), jnp.asarray(speed)))
-    return (torque - measured.drag_torque * turning) / wheels
 
 
 def _curve(ax: Axes, fit: Fit, floor: str) -> None:
