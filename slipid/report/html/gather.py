@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -247,7 +248,7 @@ def _quarters(runs: Sequence[ev.RunEvidence], data: Runs) -> ev.Quarters:
     for k, run in enumerate(runs):
         measured, predicted = (_poses(t) for t in (run.measured, run.models[run.selected]))
         edges = np.linspace(0, len(run.time_s) - 1, QUARTERS + 1).round().astype(int)
-        for i, j in zip(edges[:-1], edges[1:], strict=True):
+        for i, j in pairwise(edges.tolist()):
             seconds = run.time_s[j] - run.time_s[i]
             if seconds <= 0:
                 continue
