@@ -49,7 +49,7 @@ def sample(
     setup_jax(quiet=True)
     fit = load(out)
     _refuse_mixed(fit)
-    folder = _log_folder(out, data)
+    folder = log_folder(out, data)
     task = read_fit_task(read_config(out / "config.toml"), folder, report)
     task = replace(task, choices=fit.choices)  # those of the calibration are not in the config
     _refuse_other_logs(fit, task)
@@ -98,7 +98,7 @@ def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
     }
 
 
-def _log_folder(out: Path, data: Path | None) -> Path:
+def log_folder(out: Path, data: Path | None) -> Path:
     """Return the folder of the logs: the given one, else the folder from which the fit read them.
 
     Raises:

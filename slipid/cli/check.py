@@ -29,14 +29,19 @@ def check(
     wanted = read_config(config)
     if isinstance(wanted.content.robot, BenchMotors):
         return bench(wanted, data, out, json, quiet)
+    written: tuple[str, ...] = ()
     with Reporter(quiet=quiet) as report:
         logs, found = checks.check(config, data, out, report)
         if out is not None:
             from slipid.plots.fit import raw_plots
+            from slipid.report.html.check_page import check_page
+            from slipid.report.html.page import try_page
 
             report.stage("drawing")
-            raw_plots(logs, out)
-    emit(json, found, lambda page: show_check(page, found))
+            drawn = [path.name for path in raw_plots(logs, out)]
+            page = try_page(check_page(logs, found, config.name), out, report)
+            written = (*page, "check.json", *drawn)
+    emit(json, found, lambda page: show_check(page, found), out, written)
     return 1 if any(f["severity"] == "wrong" for f in found["findings"]) else 0
 
 
@@ -45,12 +50,17 @@ def bench(config: "Config", data: Path, out: Path | None, json: str | None, quie
     from slipid.app.bench import check_bench
     from slipid.report.estimates import show_bench_check
 
+    written: tuple[str, ...] = ()
     with Reporter(quiet=quiet) as report:
         fit, found = check_bench(config, data, out, report)
         if out is not None:
             from slipid.plots.bench import bench_plots
+            from slipid.report.html.bench_page import bench_page
+            from slipid.report.html.page import try_page
 
             report.stage("drawing")
-            bench_plots(fit, out)
-    emit(json, found, lambda page: show_bench_check(page, found))
+            drawn = [path.name for path in bench_plots(fit, out)]
+            page = try_page(bench_page(fit, config.path.name), out, report)
+            written = (*page, "check.json", *drawn)
+    emit(json, found, lambda page: show_bench_check(page, found), out, written)
     return 0

@@ -38,8 +38,9 @@ def identify(
 ) -> int:
     """Calibrate a robot, fit its motors, floors and loads, and select the model of every floor.
 
-    Writes identified.json, fit.json, robot.json and pictures. An interrupted fit is continued. The
-    exit code is 1 if the selected models are not to be trusted: on held-out runs, a simpler model
+    Writes report.html, a page to look at, identified.json, fit.json, robot.json and pictures. An
+    interrupted fit is continued. The exit code is 1 if the selected models are not to be trusted:
+    on held-out runs, a simpler model
     predicts better, or a selected force balance did not converge or is not plausible.
     """
     from slipid.app.config import BenchMotors, read_config
@@ -83,13 +84,15 @@ def calibration(
     """Return the calibration of a robot's kinematics alone, and write its results."""
     from slipid.app.calibrate import calibrate_only
     from slipid.deploy.deploy import ROBOT, calibrated_robot
+    from slipid.report.html.fit_page import write_calibration_report
 
     done = calibrate_only(task, data, out, report)
     robot = calibrated_robot(
         done.calibration, task.robot, done.models, task.dataset, task.robot_settings
     )
     robot.save(out / ROBOT)
-    return replace(done, written=(*done.written, ROBOT))
+    page = write_calibration_report(done, out, report)
+    return replace(done, written=(*page, *done.written, ROBOT))
 
 
 def run(
@@ -111,6 +114,7 @@ def run(
     from slipid.plots.drawing import save
     from slipid.plots.fit import identify_plots
     from slipid.plots.posterior import profile_figure
+    from slipid.report.html.fit_page import write_fit_report
 
     done = identify(task, data, out, report, profiles)
     report.stage("drawing")
@@ -122,7 +126,8 @@ def run(
         report.line(f"no further pictures: {error}")
     if done.profiles:
         drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
-    return replace(done, written=(*done.written, *(path.name for path in drawn)))
+    page = write_fit_report(done.fit, done.task.dataset, out, report)
+    return replace(done, written=(*page, *done.written, *(path.name for path in drawn)))
 
 
 def bench(
@@ -132,6 +137,8 @@ def bench(
     from slipid.app.bench import identify_bench
     from slipid.plots.bench import bench_plots
     from slipid.report.estimates import show_bench
+    from slipid.report.html.bench_page import bench_page
+    from slipid.report.html.page import try_page
 
     if profile:
         raise DataError("--profile is not available for drive = 'motor'; omit it")
@@ -139,5 +146,7 @@ def bench(
         fit, written = identify_bench(config, data, out, report)
         report.stage("drawing")
         written = (*written, *(path.name for path in bench_plots(fit, out)))
+        page = bench_page(fit, config.path.name)
+        written = (*try_page(page, out, report), *written)
     emit(json, fit.to_json(), lambda page: show_bench(page, fit), out, written)
     return 0 if fit.good else 1

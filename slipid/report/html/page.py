@@ -15,6 +15,7 @@ from slipid.report.html.blocks import Badge, Figure, Player, Section
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
+from slipid.support.progress import Reporter
 
 REPORT = "report.html"
 _HERE = Path(__file__).parent / "assets"
@@ -45,6 +46,15 @@ def write_page(page: Page, path: Path) -> Path:
     """
     write_bytes(path, rendered(page).encode())
     return path
+
+
+def try_page(page: Page, out: Path, report: Reporter) -> tuple[str, ...]:
+    """Write report.html to a folder and return its name, or nothing if a library is missing."""
+    try:
+        return (write_page(page, out / REPORT).name,)
+    except DataError as error:  # the results are already written
+        report.line(str(error))
+        return ()
 
 
 def rendered(page: Page) -> str:

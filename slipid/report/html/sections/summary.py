@@ -193,7 +193,7 @@ def values(found: Results) -> Section | None:
     """Return the section with all values, intervals and priors, and what to do about weak ones."""
     blocks: list[Block] = []
     if (calibration := found.calibration) is not None:
-        blocks.append(_calibration_table(calibration))
+        blocks.append(calibration_table(calibration))
     rows = list(_rows(found, fixed=False))
     if rows:
         head = ("parameter", "value", "unit", "90 % interval", "prior", "verdict", "meaning")
@@ -219,7 +219,7 @@ def _counts(found: Results) -> str:
     return enumerated([f"{words.count(w)} {w.replace('_', ' ')}" for w in names if w in words])
 
 
-def _calibration_table(c: Content) -> Table:
+def calibration_table(c: Content) -> Table:
     """Return the table of calibrated numbers."""
     rows: list[Sequence[Cell]] = []
 
