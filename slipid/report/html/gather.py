@@ -11,6 +11,7 @@ from scipy.special import fdtri
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, incomplete_poses
 from slipid.fitting.calibration.result import Calibration
+from slipid.fitting.noise import travelled
 from slipid.fitting.shared_effects import AXES
 from slipid.fitting.variances import DEGREES
 from slipid.infer.measured_windows import MeasuredWindows, driving_torque, measured_windows
@@ -197,8 +198,14 @@ def _kinematic_regions(
         for floor, stds in of_floor.items():
             names = (f"{kind}.{floor}.{axis}" for axis in AXES)
             variance |= {name: std**2 for name, std in zip(names, stds, strict=True)}
-    none = np.zeros((len(w), 3, 3)), np.zeros((len(w), 2, 2))
-    return [replay.path_covariance(seen, w, tracks, variance, *none, edge) for edge in at.tolist()]
+    p, none = tracks.predicted, (np.zeros((len(w), 3, 3)), np.zeros((len(w), 2, 2)))
+    step = np.diff(p, axis=1)
+    step[..., :2] = turned(-p[:, :-1, 2], step[..., :2])
+    motion = travelled(step, float(seen.geometry.base_radius))
+    return [
+        replay.path_covariance(seen, w, tracks, variance, *none, edge, motion)
+        for edge in at.tolist()
+    ]
 
 
 def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
