@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, emit, guarded
+from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, can_draw, emit, guarded
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -31,10 +31,9 @@ def check(
         return bench(wanted, data, out, json, quiet)
     with Reporter(quiet=quiet) as report:
         logs, found = checks.check(config, data, out, report)
-        if out is not None:
+        if out is not None and can_draw(report):
             from slipid.plots.fit import raw_plots
 
-            report.stage("drawing")
             raw_plots(logs, out)
     emit(json, found, lambda page: show_check(page, found))
     return 1 if any(f["severity"] == "wrong" for f in found["findings"]) else 0
@@ -47,10 +46,9 @@ def bench(config: "Config", data: Path, out: Path | None, json: str | None, quie
 
     with Reporter(quiet=quiet) as report:
         fit, found = check_bench(config, data, out, report)
-        if out is not None:
+        if out is not None and can_draw(report):
             from slipid.plots.bench import bench_plots
 
-            report.stage("drawing")
             bench_plots(fit, out)
     emit(json, found, lambda page: show_bench_check(page, found))
     return 0

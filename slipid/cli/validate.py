@@ -10,6 +10,7 @@ from slipid.cli.common import (
     Out,
     OutFolder,
     Quiet,
+    can_draw,
     emit,
     for_robots,
     option,
@@ -49,14 +50,15 @@ def run(out: Path, data: Path, report: Reporter, logs: str | None = None) -> Con
     """
     from slipid.app.compare import validate, validate_calibration
     from slipid.infer.fit_file import FIT, IDENTIFIED
-    from slipid.plots.fit import validate_plots
 
     if (out / IDENTIFIED).exists() and not (out / FIT).exists():
         return validate_calibration(out, data, report, logs).to_json()
     fit, dataset, found = validate(out, data, report, logs)
-    report.stage("drawing")
-    drawn = validate_plots(fit, dataset, found, out)
-    report.line(f"in {out}: {', '.join(path.name for path in drawn)}")
+    if can_draw(report):
+        from slipid.plots.fit import validate_plots
+
+        drawn = validate_plots(fit, dataset, found, out)
+        report.line(f"in {out}: {', '.join(path.name for path in drawn)}")
     return found.to_json()
 
 
@@ -77,11 +79,15 @@ def compare(
     Writes comparison.json and a picture. Finished folds are kept in OUT and are not fitted again.
     """
     from slipid.app.compare import compare as run
-    from slipid.plots.compare import compare_plot
     from slipid.report.answers import show_comparison
 
     with Reporter(quiet=quiet) as report:
         found = run(config, data, out, folds.replace(" ", "").split(","), report)
-        report.line(f"written to {out}: comparison.json, {compare_plot(found, out).name}")
+        written = ["comparison.json"]
+        if can_draw(report):
+            from slipid.plots.compare import compare_plot
+
+            written.append(compare_plot(found, out).name)
+        report.line(f"written to {out}: {', '.join(written)}")
     emit(json, found, lambda page: show_comparison(page, found))
     return 0 if all(q["converged"] for q in found["questions"].values()) else 1

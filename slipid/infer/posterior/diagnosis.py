@@ -119,6 +119,9 @@ class Posterior:
     @cached_property
     def tree(self) -> "DataTree":
         """ArviZ DataTree of draws, likelihoods and replicated data."""
+        from slipid.infer.posterior import require_packages
+
+        require_packages()
         from slipid.infer.posterior import sample as netcdf
 
         return netcdf.tree(self)
@@ -150,6 +153,9 @@ class Posterior:
 
     def save(self, path: Path | str) -> None:
         """Write posterior.nc completely or not at all."""
+        from slipid.infer.posterior import require_packages
+
+        require_packages()
         from slipid.infer.posterior import sample as netcdf
 
         netcdf.write(self.tree, Path(path))
