@@ -35,7 +35,7 @@ def sample(
     quiet: Quiet = False,
 ) -> int:
     """Sample the posterior of a fit with emcee, for more exact intervals."""
-    from slipid.infer.posterior import require_packages
+    from slipid.infer.posterior.blocks import Plan, require_packages
     from slipid.report.estimates import show_sample
     from slipid.support.files import read_json
 
@@ -43,7 +43,6 @@ def sample(
     from slipid.app.sample import WRITTEN
     from slipid.app.sample import sample as run
     from slipid.deploy.deploy import write_robot
-    from slipid.infer.posterior.blocks import Plan
 
     with Reporter(quiet=quiet) as report:
         posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)

@@ -266,10 +266,10 @@ class Fit:
         Raises:
             MissingExtra: a package is not installed; the message names the command to type.
         """
-        from slipid.infer.posterior import require_packages
+        from slipid.infer.posterior import blocks
 
-        require_packages()
-        from slipid.infer.posterior import blocks, sample
+        blocks.require_packages()
+        from slipid.infer.posterior import sample
 
         plan = plan or blocks.Plan(seed=seed, most=most)
         with Reporter(quiet=quiet) as report:
