@@ -126,7 +126,7 @@ PANELS: dict[str, tuple[Command, ...]] = {
         Command(
             floors,
             "Find the floor under each wheel in logged runs",
-            "slipid floors out/robot --map floor/map.geojson --data logs",
+            "slipid floors out/robot --map map.geojson --data logs --out under",
         ),
     ),
     "Laboratory": (
@@ -149,7 +149,7 @@ PANELS: dict[str, tuple[Command, ...]] = {
 class CommandHelp(TyperCommand):
     """A command whose help lists its options in panels, as text that is not boxed."""
 
-    def format_options(self, ctx: typer.Context, formatter: Any) -> None:
+    def format_options(self, ctx: Any, formatter: Any) -> None:
         panels: dict[str, list[tuple[str, str]]] = {}
         for one in self.get_params(ctx):
             default = "Arguments" if one.param_type_name == "argument" else "Options"
@@ -166,13 +166,13 @@ class CommandHelp(TyperCommand):
 class CommandList(TyperGroup):
     """The group of all commands, whose help lists them in panels, a line each."""
 
-    def format_commands(self, ctx: typer.Context, formatter: Any) -> None:
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
         width = max(len(_name(one)) for commands in PANELS.values() for one in commands)
         for panel, commands in PANELS.items():
             with _section(formatter, panel):
                 formatter.write_dl([(_name(one).ljust(width), one.line) for one in commands])
 
-    def format_options(self, ctx: typer.Context, formatter: Any) -> None:
+    def format_options(self, ctx: Any, formatter: Any) -> None:
         self.format_commands(ctx, formatter)
         records = [one.get_help_record(ctx) for one in self.get_params(ctx)]
         with _section(formatter, "Options"):
