@@ -29,13 +29,19 @@ def check(
     wanted = read_config(config)
     if isinstance(wanted.content.robot, BenchMotors):
         return bench(wanted, data, out, json, quiet)
+    written: tuple[str, ...] = ()
     with Reporter(quiet=quiet) as report:
         logs, found = checks.check(config, data, out, report)
-        if out is not None and can_draw(report):
-            from slipid.plots.fit import raw_plots
+        if out is not None:
+            from slipid.report.html.check_page import check_page
+            from slipid.report.html.page import try_page
 
-            raw_plots(logs, out)
-    emit(json, found, lambda page: show_check(page, found))
+            written = (*try_page(check_page(logs, found, config.name), out, report), "check.json")
+            if can_draw(report):
+                from slipid.plots.fit import raw_plots
+
+                written += tuple(path.name for path in raw_plots(logs, out))
+    emit(json, found, lambda page: show_check(page, found), out, written)
     return 1 if any(f["severity"] == "wrong" for f in found["findings"]) else 0
 
 
@@ -44,11 +50,17 @@ def bench(config: "Config", data: Path, out: Path | None, json: str | None, quie
     from slipid.app.bench import check_bench
     from slipid.report.estimates import show_bench_check
 
+    written: tuple[str, ...] = ()
     with Reporter(quiet=quiet) as report:
         fit, found = check_bench(config, data, out, report)
-        if out is not None and can_draw(report):
-            from slipid.plots.bench import bench_plots
+        if out is not None:
+            from slipid.report.html.bench_page import bench_page
+            from slipid.report.html.page import try_page
 
-            bench_plots(fit, out)
-    emit(json, found, lambda page: show_bench_check(page, found))
+            written = (*try_page(bench_page(fit, config.path.name), out, report), "check.json")
+            if can_draw(report):
+                from slipid.plots.bench import bench_plots
+
+                written += tuple(path.name for path in bench_plots(fit, out))
+    emit(json, found, lambda page: show_bench_check(page, found), out, written)
     return 0

@@ -43,9 +43,11 @@ def demo(
     show_truth(page, done.fit, truth)
     page.line("open-loop predictions of runs that were not fitted:")
     show_validation(page, found)
-    pictures = [result / name for name in done.written if name.endswith(".png")]
-    pictures += sorted(result.glob("validation_*.png"))
-    page.line(f"\nlook at: {', '.join(map(str, pictures))}")
+    pictures = [name for name in done.written if name.endswith(".png")]
+    pictures += sorted(path.name for path in result.glob("validation_*.png"))
+    first = result / next(iter(done.written))
+    page.line(f"\nlook at: {first}")
+    page.line(f"pictures in {result}: {', '.join(pictures)}")
     page.line(f"values: {result / 'identified.json'}, {result / 'validation.json'}")
     return 0 if done.fit.converged else 1
 
@@ -69,7 +71,8 @@ def run(
     from slipid.app.logs import packaged_config, unpack
     from slipid.cli.identify import run as identify
     from slipid.cli.validate import run as validate
-    from slipid.support.files import read_json, write_bytes, write_json
+    from slipid.report.html.fit_page import write_report
+    from slipid.support.files import read_json, write_bytes
 
     if plant not in ("recorded", "mujoco"):
         raise DataError(f"--plant {plant}: unknown; expected recorded or mujoco")
@@ -86,7 +89,8 @@ def run(
     logs = source / "fit" / "logs"
     done = identify(checked_task(out / "robotino.toml", logs, report), logs, result, report)
     found = validate(result, source / "unseen" / "logs", report)
-    write_json(result / "validation.json", found)
+    report.stage("writing the page")
+    write_report(result)
     truth = read_json(
         source / "fit/truth/truth.json", "the true values that `slipid simulate` wrote"
     )

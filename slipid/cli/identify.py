@@ -49,8 +49,9 @@ def identify(
 ) -> int:
     """Calibrate a robot, fit its motors, floors and loads, and select the model of every floor.
 
-    Writes identified.json, fit.json, robot.json and pictures. An interrupted fit is continued. The
-    exit code is 1 if the selected models are not to be trusted: on held-out runs, a simpler model
+    Writes report.html, a page to look at, identified.json, fit.json, robot.json and pictures. An
+    interrupted fit is continued. The exit code is 1 if the selected models are not to be trusted:
+    on held-out runs, a simpler model
     predicts better, or a selected force balance did not converge or is not plausible.
     """
     from slipid.app.config import BenchMotors, read_config
@@ -94,13 +95,15 @@ def calibration(
     """Return the calibration of a robot's kinematics alone, and write its results."""
     from slipid.app.calibrate import calibrate_only
     from slipid.deploy.deploy import ROBOT, calibrated_robot
+    from slipid.report.html.fit_page import write_calibration_report
 
     done = calibrate_only(task, data, out, report)
     robot = calibrated_robot(
         done.calibration, task.robot, done.models, task.dataset, task.robot_settings
     )
     robot.save(out / ROBOT)
-    return replace(done, written=(*done.written, ROBOT))
+    page = write_calibration_report(done, out, report)
+    return replace(done, written=(*page, *done.written, ROBOT))
 
 
 def run(
@@ -119,12 +122,14 @@ def run(
     """
     from slipid.app.identify import identify
     from slipid.deploy.deploy import write_robot
+    from slipid.report.html.fit_page import write_fit_report
 
     done = identify(task, data, out, report, profiles)
     written = (*done.written, *write_robot(out, done.fit))
     if can_draw(report):
         written += tuple(path.name for path in _draw(done, out, report))
-    return replace(done, written=written)
+    page = write_fit_report(done.fit, done.task.dataset, out, report)
+    return replace(done, written=(*page, *written))
 
 
 def _draw(done: "IdentifyResult", out: Path, report: Reporter) -> list[Path]:
@@ -150,6 +155,8 @@ def bench(
     """Identify motors on a bench, write and print the result, and return the exit code."""
     from slipid.app.bench import identify_bench
     from slipid.report.estimates import show_bench
+    from slipid.report.html.bench_page import bench_page
+    from slipid.report.html.page import try_page
 
     if profile:
         raise DataError("--profile is not available for drive = 'motor'; omit it")
@@ -159,5 +166,7 @@ def bench(
             from slipid.plots.bench import bench_plots
 
             written = (*written, *(path.name for path in bench_plots(fit, out)))
+        page = bench_page(fit, config.path.name)
+        written = (*try_page(page, out, report), *written)
     emit(json, fit.to_json(), lambda page: show_bench(page, fit), out, written)
     return 0 if fit.good else 1

@@ -26,6 +26,7 @@ from slipid.cli.identify import identify
 from slipid.cli.map import map_
 from slipid.cli.motor import motor
 from slipid.cli.new import new, reference
+from slipid.cli.report import report
 from slipid.cli.sample import sample
 from slipid.cli.selftest import selftest
 from slipid.cli.simulate import simulate
@@ -74,6 +75,11 @@ PANELS: dict[str, tuple[Command, ...]] = {
             validate,
             "Predict runs that the fit has not seen",
             "slipid validate out/robot --data other --json validation.json",
+        ),
+        Command(
+            report,
+            "Write the page of a fit again, with all results since",
+            "slipid report out/robot",
         ),
         Command(
             compare,

@@ -50,8 +50,8 @@ def motor(
     The log needs the voltage, current and speed of the motor. Columns that are not given are found
     by their names. For several motors, separate their columns by commas. The speed must be that of
     the motor shaft; a speed measured behind a gear cannot be detected and gives wrong results. With
-    --out, the command writes motor.json and a picture. The exit code is 1 if the model does not
-    explain the log.
+    --out, the command writes report.html, motor.json and a picture. The exit code is 1 if the model
+    does not explain the log.
     """
     from slipid.app.bench import read_motor_log
     from slipid.data.reading.motor_layout import given_columns
@@ -74,10 +74,14 @@ def motor(
         fit = task.fit(report)
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:
+            from slipid.report.html.bench_page import bench_page
+            from slipid.report.html.page import try_page
+
             write_json(out / "motor.json", content)
             if can_draw(report):
                 from slipid.plots.bench import bench_plots
 
                 written += [path.name for path in bench_plots(fit, out)]
+            written[:0] = try_page(bench_page(fit, file.name, task.columns_used), out, report)
     emit(json, content, lambda page: show_bench(page, fit, task.columns_used), out, written)
     return 0 if fit.good else 1

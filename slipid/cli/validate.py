@@ -18,6 +18,9 @@ from slipid.cli.common import (
 from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
+VALIDATION = "validation.json"
+"""Name of the file in the result folder, which the page of the results shows."""
+
 
 @for_robots
 def validate(
@@ -34,7 +37,10 @@ def validate(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Predict runs open loop with the fit and with simpler models; compare with logged poses."""
+    """Predict runs open loop with the fit and with simpler models; compare with logged poses.
+
+    Writes validation.json and pictures to OUT.
+    """
     from slipid.report.estimates import show_validation
 
     with Reporter(quiet=quiet) as report:
@@ -44,22 +50,27 @@ def validate(
 
 
 def run(out: Path, data: Path, report: Reporter, logs: str | None = None) -> Content:
-    """Return the content of the validation file of runs, and draw their pictures.
+    """Return the content of validation.json, and write it with pictures to the result folder.
 
     Arguments are those of `slipid.app.compare.validate`.
     """
     from slipid.app.compare import validate, validate_calibration
     from slipid.infer.fit_file import FIT, IDENTIFIED
+    from slipid.support.files import write_json
 
     if (out / IDENTIFIED).exists() and not (out / FIT).exists():
-        return validate_calibration(out, data, report, logs).to_json()
+        content = validate_calibration(out, data, report, logs).to_json()
+        write_json(out / VALIDATION, content)
+        return content
     fit, dataset, found = validate(out, data, report, logs)
+    content = found.to_json()
+    write_json(out / VALIDATION, content)
     if can_draw(report):
         from slipid.plots.fit import validate_plots
 
         drawn = validate_plots(fit, dataset, found, out)
-        report.line(f"in {out}: {', '.join(path.name for path in drawn)}")
-    return found.to_json()
+        report.line(f"in {out}: {VALIDATION}, {', '.join(path.name for path in drawn)}")
+    return content
 
 
 @for_robots

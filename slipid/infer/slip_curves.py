@@ -1,5 +1,6 @@
 """Curves of slip over torque on every floor with 90 % bands, and the ranges that the runs cover."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax
@@ -48,6 +49,31 @@ class SlipCurve:
     slip_hi: Float[np.ndarray, " torque"]
     wheel_speed: float
     load_share: float
+
+
+LEAST_RANK_CORRELATION = 0.3
+"""Smallest rank correlation at which measured slip rises with torque [1]."""
+
+
+def slip_sentence(
+    dots: Mapping[str, tuple[Float[np.ndarray, " wheel"], Float[np.ndarray, " wheel"]]],
+) -> str:
+    """Return a sentence on the floors where the measured slip of wheels rises with their torque.
+
+    Args:
+        dots: torques [N m] and measured slips [1] of wheels, keyed by floor.
+    """
+    from scipy.stats import spearmanr
+
+    rises, others = [], []
+    for floor, (torque, slip) in dots.items():
+        varied = len(torque) > 5 and np.ptp(torque) > 0 and np.ptp(slip) > 0
+        rank = float(spearmanr(torque, slip).statistic) if varied else 0.0
+        (rises if rank > LEAST_RANK_CORRELATION else others).append(floor)
+    if not rises:
+        return "The measured slip of the wheels does not rise with their torque"
+    where = f"The slip of a wheel rises with its torque on {', '.join(rises)}"
+    return f"{where}; no rise shows on {', '.join(others)}" if others else where
 
 
 def wheel_states(robot: Robot, b: lk.Batch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

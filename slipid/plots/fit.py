@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrow, Polygon
 
 from slipid.data.runs import Runs
+from slipid.infer.measured_windows import MeasuredWindows, measured_windows
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.plots import drawing
 from slipid.plots.drawing import add_warning, figure, save, save_all
-from slipid.plots.measured_windows import MeasuredWindows, measured_windows
 from slipid.plots.motion import heading_figure, path_figure, runs_by_setup
 from slipid.plots.wheels import current_figure, curve_figure
 from slipid.predict.validation import Validation

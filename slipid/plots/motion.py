@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
+from slipid.infer.measured_windows import MeasuredWindows, by_heading
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.plots import drawing
-from slipid.plots.measured_windows import MeasuredWindows, by_heading
 from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import Encoder
 from slipid.predict.slip_models import FloorModels

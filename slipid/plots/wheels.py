@@ -1,5 +1,7 @@
 """Figures of single wheels: slip over torque, and motor current over predicted traction."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -7,11 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
+from slipid.infer.measured_windows import MeasuredWindows, driving_torque
 from slipid.infer.result import Fit
+from slipid.infer.slip_curves import slip_sentence
 from slipid.model import contact_law as law
 from slipid.model.robot import GRAVITY, Robot
 from slipid.plots import drawing
-from slipid.plots.measured_windows import MeasuredWindows
 from slipid.plots.motion import named
 
 SIDEWAYS_COLOUR = "#35B779"
@@ -29,13 +32,13 @@ def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
     Dots are the measured slips of all wheels.
     """
     floors = list(dict.fromkeys(floor for floor, _ in measured.groups))
-    title = "Slip increases with the torque of a wheel"
-    if rolls := not all(fit.robot.geometry.grips):
-        title += ", and further if the wheel also rolls sideways"
+    each = {floor: _slips(fit.robot, measured, floor) for floor in floors}
+    title = slip_sentence({floor: (d.torque, d.slip) for floor, d in each.items()})
+    rolls = not all(fit.robot.geometry.grips)
     made, axes = drawing.panels(len(floors), 3.7, 3.9, title)
     drawn = None
     for ax, floor in zip(axes, floors, strict=True):
-        drawn = _cloud(ax, fit.robot, measured, floor) or drawn
+        drawn = _cloud(ax, each[floor]) or drawn
         (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
         _curve(ax, fit, floor)
         ax.set(xlim=(min(0.0, left), right), ylim=(min(0.0, bottom), top))
@@ -53,44 +56,32 @@ def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
     return made
 
 
-def _cloud(ax: Axes, robot: Robot, measured: MeasuredWindows, floor: str) -> PathCollection | None:
-    """Draw the measured slip of every turning wheel over its torque, scaled to an even load.
+class _Slips(NamedTuple):
+    """Torque [N m], scaled to an even load, slip and sideways over rim speed of turning wheels."""
 
-    Returns:
-        None if no wheel turns on this floor.
-    """
+    torque: np.ndarray
+    slip: np.ndarray
+    sideways: np.ndarray
+
+
+def _slips(robot: Robot, measured: MeasuredWindows, floor: str) -> _Slips:
+    """Return the measured slips of all wheels that turn on a floor."""
     mine = np.array([measured.groups[g][0] == floor for g in measured.group])
     fastest = np.abs(measured.wheel_speed).max(axis=1, keepdims=True)
     turns = (np.abs(measured.wheel_speed) > TOO_SLOW * fastest) & mine[:, None]
     turns &= np.isfinite(measured.wheel_slip)
-    if not turns.any():
-        return None
     torque = driving_torque(robot, measured) / (measured.share * measured.share.shape[1])
-    order = np.argsort(-measured.sideways[turns])
-    x, y = torque[turns][order], measured.wheel_slip[turns][order]
-    colour = np.minimum(measured.sideways[turns], 2.0)[order]
+    return _Slips(torque[turns], measured.wheel_slip[turns], measured.sideways[turns])
+
+
+def _cloud(ax: Axes, dots: _Slips) -> PathCollection | None:
+    """Draw the measured slip of every turning wheel over its torque; return None for no wheel."""
+    if not len(dots.slip):
+        return None
+    order = np.argsort(-dots.sideways)
+    colour = np.minimum(dots.sideways, 2.0)[order]
+    x, y = dots.torque[order], dots.slip[order]
     return ax.scatter(x, y, 7, colour, lw=0, alpha=0.6, cmap="viridis_r", vmin=0.0, vmax=2.0)
-
-
-def driving_torque(robot: Robot, measured: MeasuredWindows) -> np.ndarray:
-    """Return the traction torque of each drive per wheel, positive along the wheel's motion [N m].
-
-    The torque follows from the measured current; if currents were not logged, it is the predicted
-    one. A current that is logged as a magnitude gets the sign of the prediction.
-    """
-    turning, wheels = np.sign(measured.wheel_speed), robot.geometry.wheels / robot.geometry.drives
-    if measured.amps is None:
-        return measured.torque * turning / wheels
-    speed = np.abs(measured.wheel_speed)
-    amps = measured.amps * turning
-    if measured.unsigned:
-        driven = (
-            (measured.torque + measured.drag_torque) * turning
-            + np.asarray(robot.motor.friction(jnp.asarray(speed)))
-        ) >= 0
-        amps = (measured.amps - float(robot.motor.current_offset)) * np.where(driven, 1.0, -1.0)
-    torque = np.asarray(robot.motor.torque(jnp.asarray(amps), jnp.asarray(speed)))
-    return (torque - measured.drag_torque * turning) / wheels
 
 
 def _curve(ax: Axes, fit: Fit, floor: str) -> None:

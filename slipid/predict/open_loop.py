@@ -1,4 +1,4 @@
-"""Open-loop prediction of paths from the first pose, with the uncertainty of their end points.
+"""Open-loop prediction of paths from the first pose, with the uncertainty of their points.
 
 All poses are in metres as corrected by the fitted camera. A prediction uses only the first of the
 measured poses.
@@ -141,15 +141,17 @@ def tracks_from_increments(
 
 
 @eqx.filter_jit
-def end_jacobian(
+def path_jacobian(
     space: Space,
     z: Numbers,
     b: lk.Batch,
     start: Numbers,
     twist: Numbers | None = None,
     effects: tuple[Numbers, Numbers] | None = None,
-) -> Float[Array, "segment 2 free"]:
-    """Return the derivative of end points with respect to the search vector, for fixed start poses.
+) -> Float[Array, "segment window 2 free"]:
+    """Return the derivative of the points of paths with respect to the search vector.
+
+    The start poses are fixed; there is a point after every window.
 
     The path follows body twists (segment, window, 3) if `twist` is given, else the contact
     equilibrium. `effects`, if given, holds the increments by expected shared effects (segment,
@@ -157,7 +159,7 @@ def end_jacobian(
     vector.
     """
 
-    def end(x: Array) -> Array:
+    def path(x: Array) -> Array:
         robot = space.tree(x)
         if twist is not None:
             step = lk.marker_increments(robot, jnp.asarray(twist), b.dt, b.session)
@@ -166,37 +168,43 @@ def end_jacobian(
         if effects is not None:
             mean, slope = effects
             step -= mean + slope @ (x - jnp.asarray(z))
-        return chain(start, step)[:, -1, :2]
+        return chain(start, step)[:, 1:, :2]
 
-    return jax.jacfwd(end)(z)
+    return jax.jacfwd(path)(z)
 
 
-def end_covariance(
+def path_covariance(
     robot: Robot,
     w: Windows,
     tracks: Tracks,
     variance: Mapping[str, float],
     shared: Float[np.ndarray, "segment 3 3"],
     of_parameters: Float[np.ndarray, "segment 2 2"],
+    edge: int = -1,
 ) -> Float[np.ndarray, "segment 2 2"]:
-    """Return the scale matrices of the Student t of predicted less measured end points [m^2].
+    """Return the scale matrices of the Student t of predicted less measured points of paths [m^2].
 
     The matrices include process noise, the individual run effect, shared effects, camera noise of
-    the first and last position and of the start heading, and the uncertainty of the parameters;
-    each is propagated to the end point along the predicted path.
+    the first position, of the position at the edge and of the start heading, and the uncertainty of
+    the parameters; each is propagated to the point along the predicted path.
 
     Args:
+        robot: robot with its camera.
+        w: windows of the runs.
+        tracks: predicted paths of the runs.
         variance: variances of the noise components, keyed by name.
         shared: covariance of the shared effects along, across and in yaw.
-        of_parameters: covariance of the end points due to uncertain parameters.
+        of_parameters: covariance of the points due to uncertain parameters.
+        edge: index of the point on the path, by default its end.
     """
     far, u = travel(w, robot)
-    p = tracks.predicted
+    p = tracks.predicted[:, : edge % tracks.predicted.shape[1] + 1]
+    far, u = far[:, : p.shape[1] - 1], u[:, : p.shape[1] - 1]
     cov = of_parameters.copy()
-    # Vector by which the end point shifts per radian of yaw in each step.
+    # Vector by which the point shifts per radian of yaw in each step.
     lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])
-    way = p[:, :-1, 2]
-    along, across = turned(way, u), turned(way, turned_left(u))
+    yaw = p[:, :-1, 2]
+    along, across = turned(yaw, u), turned(yaw, turned_left(u))
     process, run = (by_axis(variance, k, w) for k in ("process", "run"))
     axes = np.stack((along, across, lever))
     cov += np.einsum("na,nk,anki,ankj->nij", process, far, axes, axes)

@@ -17,7 +17,7 @@ the camera propagate to the coefficients of the simpler models.
 """
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -56,6 +56,7 @@ from slipid.search_space import Space
 
 Residuals = Float[np.ndarray, "segment m"]
 Slopes = Float[np.ndarray, "segment m number"]
+PointSlopes = Float[np.ndarray, "segment window 2 number"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +98,32 @@ class PredictiveModel(abc.ABC):
         """
 
     @abc.abstractmethod
-    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
-        """Return tracks of whole runs and the derivatives of end points (segment, 2, number)."""
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, PointSlopes]:
+        """Return tracks of whole runs and the derivatives of their points.
+
+        The derivatives have the shape (segment, window, 2, number).
+        """
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
         """Return tracks of whole runs and the scale matrices [m^2] of their end points."""
+        tracks, (end,) = self.points(w, (w.dt.shape[1],))
+        return tracks, end
+
+    def points(
+        self, w: Windows, edges: Sequence[int]
+    ) -> tuple[replay.Tracks, list[Float[np.ndarray, "segment 2 2"]]]:
+        """Return tracks of whole runs, and the scale matrices [m^2] of their points at `edges`.
+
+        Edges are counted from 1, the point after the first window.
+        """
         tracks, slope = self.tracks_and_slopes(w)
-        numbers, effect = self._number_covariance(w, slope), self.effect_covariance(w)
-        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, numbers)
+        effect, known = self.effect_covariance(w), (self.robot, w, tracks, self.variance)
+        return tracks, [
+            replay.path_covariance(
+                *known, effect, self._number_covariance(w, slope[:, edge - 1]), edge
+            )
+            for edge in edges
+        ]
 
     def scale(self, problem: Problem) -> tuple[Residuals, Float[np.ndarray, "segment m m"]]:
         """Return every segment's residuals, and the scale matrix of their Student t."""
@@ -241,11 +260,11 @@ class ForceBalance(PredictiveModel):
         mean = self._correction(w)[0].reshape(increments.shape)
         return replay.tracks_from_increments(self.robot, w, increments - mean)
 
-    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, PointSlopes]:
         tracks, (mean, slope) = self.tracks(w), self._correction(w)
         expected = mean.reshape(*w.dt.shape, 3), slope.reshape(*w.dt.shape, 3, -1)
         b, start = lk.batch(w, self.robot), tracks.predicted[:, 0]
-        by_z = replay.end_jacobian(self.space, self.z, b, start, effects=expected)
+        by_z = replay.path_jacobian(self.space, self.z, b, start, effects=expected)
         return tracks, np.asarray(by_z)
 
 

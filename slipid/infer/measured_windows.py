@@ -30,6 +30,7 @@ class MeasuredWindows:
     The value of a drive is the mean over its wheels or, for loads and torques, their sum.
 
     Attributes:
+        run: index of the run of each segment.
         group: index of each segment's floor and load set-up in `groups`.
         groups: pairs (floor, load set-up), sorted from the floor with the smallest median slip.
         speed: commanded speed of the body, or its speed by encoders if there is no command, rounded
@@ -53,6 +54,7 @@ class MeasuredWindows:
         unsigned: True if currents were logged as magnitudes.
     """
 
+    run: np.ndarray
     group: np.ndarray
     groups: tuple[tuple[str, str], ...]
     speed: Float[np.ndarray, " segment"]
@@ -109,6 +111,7 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
     groups = tuple(sorted(set(pairs), key=lambda pair: (lost[pair[0]], *pair)))
     wanted = data.speed[w.run]
     return MeasuredWindows(
+        run=w.run,
         group=np.array([groups.index(p) for p in pairs]),
         groups=groups,
         speed=np.round(np.where(np.isfinite(wanted), wanted, length / time), 2),
@@ -129,6 +132,27 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
         drag_torque=whole(drag_torque),
         unsigned=not w.current_is_signed,
     )
+
+
+def driving_torque(robot: Robot, measured: MeasuredWindows) -> np.ndarray:
+    """Return the traction torque of each drive per wheel, positive along the wheel's motion [N m].
+
+    The torque follows from the measured current; if currents were not logged, it is the predicted
+    one. A current that is logged as a magnitude gets the sign of the prediction.
+    """
+    turning, wheels = np.sign(measured.wheel_speed), robot.geometry.wheels / robot.geometry.drives
+    if measured.amps is None:
+        return measured.torque * turning / wheels
+    speed = np.abs(measured.wheel_speed)
+    amps = measured.amps * turning
+    if measured.unsigned:
+        driven = (
+            (measured.torque + measured.drag_torque) * turning
+            + np.asarray(robot.motor.friction(jnp.asarray(speed)))
+        ) >= 0
+        amps = (measured.amps - float(robot.motor.current_offset)) * np.where(driven, 1.0, -1.0)
+    torque = np.asarray(robot.motor.torque(jnp.asarray(amps), jnp.asarray(speed)))
+    return (torque - measured.drag_torque * turning) / wheels
 
 
 def by_heading(

@@ -1,0 +1,222 @@
+"""Evidence of a fit: what a report shows of the logs, so that it needs neither logs nor models.
+
+`identify` writes it to the result folder as evidence.json. Numbers are rounded to what a screen can
+show: millimetres, milliradians and hundredths.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from slipid.support.errors import DataError
+from slipid.support.files import write_bytes
+
+EVIDENCE, SCHEMA = "evidence.json", "slipid.evidence/1"
+
+
+class _Record(BaseModel):
+    """An immutable part of the evidence, without other keys than the declared ones."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Track(_Record):
+    """Poses along a run, in the frame of the logged poses, as corrected by the camera.
+
+    Attributes:
+        x_mm, y_mm: position [mm].
+        yaw_mrad: heading [mrad].
+    """
+
+    x_mm: list[int]
+    y_mm: list[int]
+    yaw_mrad: list[int]
+
+
+class Region(_Record):
+    """The 90 % regions of some predicted points of a run, which are ellipses.
+
+    Attributes:
+        edge: index of each point on the track.
+        major_mm, minor_mm: half axes [mm].
+        angle_mrad: direction of the major axis [mrad].
+    """
+
+    edge: list[int]
+    major_mm: list[float]
+    minor_mm: list[float]
+    angle_mrad: list[int]
+
+
+class RunEvidence(_Record):
+    """A run with its measured and predicted paths.
+
+    Attributes:
+        name, floor, load: name of the run, its floor and its load set-up.
+        heading_deg: commanded direction of travel [deg], None if unknown.
+        speed: commanded speed [m/s], None if unknown.
+        seconds: duration [s].
+        path_m: measured path length [m].
+        time_s: time of each pose [s].
+        measured: measured poses.
+        models: predicted poses, keyed by model; all begin at the first measured pose.
+        region: regions of the model that was selected on the floor.
+        selected: name of this model.
+    """
+
+    name: str
+    floor: str
+    load: str
+    heading_deg: float | None
+    speed: float | None
+    seconds: float
+    path_m: float
+    time_s: list[float]
+    measured: Track
+    models: Mapping[str, Track]
+    region: Region | None
+    selected: str
+
+
+class Quarters(_Record):
+    """Quarters of runs: how they were driven, and errors of the selected model, as columns.
+
+    Attributes:
+        run: index of the run.
+        time_s: middle of the quarter from the start of the run [s].
+        seconds: duration [s].
+        speed: mean speed [m/s].
+        turn_deg_s: mean yaw rate [deg/s].
+        heading_deg: direction of travel in the body frame, 0 to 360 [deg]; None where it turns on
+            the spot.
+        along_mm_s, across_mm_s: predicted less measured motion [mm/s].
+        yaw_deg_s: predicted less measured yaw rate [deg/s].
+    """
+
+    run: list[int]
+    time_s: list[float]
+    seconds: list[float]
+    speed: list[float]
+    turn_deg_s: list[float]
+    heading_deg: list[float | None]
+    along_mm_s: list[float]
+    across_mm_s: list[float]
+    yaw_deg_s: list[float]
+
+
+class WheelDots(_Record):
+    """Measured slip and torque of the wheels in segments of the runs, as columns.
+
+    Attributes:
+        run: index of the run.
+        drive: index of the drive.
+        torque_nm: driving torque per wheel, scaled to an even load [N m].
+        slip: slip of the wheel [1].
+    """
+
+    run: list[int]
+    drive: list[int]
+    torque_nm: list[float]
+    slip: list[float]
+
+
+class CurrentDots(_Record):
+    """Measured and predicted motor currents in segments of the runs, as columns [A].
+
+    Attributes:
+        run: index of the run.
+        drive: index of the drive.
+        measured: measured currents.
+        start: currents predicted before the fit, with every parameter at its start value.
+        fitted: currents predicted by the fit.
+    """
+
+    run: list[int]
+    drive: list[int]
+    measured: list[float]
+    start: list[float]
+    fitted: list[float]
+
+
+class Wheels(_Record):
+    """Wheels of the robot, seen from above.
+
+    Attributes:
+        place_m: position of each wheel ahead of and to the left of the middle [m].
+        angle_deg: drive direction of each wheel from straight ahead [deg].
+        drive: index of the drive of each wheel.
+        radius_m: radius of the wheels [m].
+        sideways: True if the wheels determine motion sideways.
+    """
+
+    place_m: list[tuple[float, float]]
+    angle_deg: list[float]
+    drive: list[int]
+    radius_m: float
+    sideways: bool
+
+
+class Correlations(_Record):
+    """Correlations of the fitted parameters in the Laplace covariance.
+
+    Attributes:
+        names: names of the parameters.
+        percent: correlations [%], row by row.
+    """
+
+    names: list[str]
+    percent: list[list[int]]
+
+
+class Evidence(_Record):
+    """Everything that a report shows of the logs.
+
+    Attributes:
+        schema_: name and version of the format.
+        data_hash: hash of the logs, which run.json and identified.json repeat.
+        wheels: wheels of the robot.
+        runs: runs with their paths; empty if poses lack coordinates.
+        quarters: quarters of the runs.
+        slip: slip and torque of the wheels, None for a calibration without a force balance.
+        currents: motor currents, None if they are not logged or no force balance was fitted.
+        correlations: correlations of the fitted parameters, None without a force balance.
+        notes: sentences on what the evidence lacks, and why.
+    """
+
+    schema_: str = SCHEMA
+    data_hash: str
+    wheels: Wheels
+    runs: list[RunEvidence]
+    quarters: Quarters
+    slip: WheelDots | None = None
+    currents: CurrentDots | None = None
+    correlations: Correlations | None = None
+    notes: list[str] = []
+
+
+def write_evidence(found: Evidence, out: Path) -> Path:
+    """Write evidence.json to a folder and return its path."""
+    path = out / EVIDENCE
+    write_bytes(path, found.model_dump_json().encode())
+    return path
+
+
+def read_evidence(path: Path) -> Evidence:
+    """Return the content of evidence.json.
+
+    Raises:
+        DataError: the file cannot be read, or is not evidence of this version.
+    """
+    expected = "expected the evidence that `slipid identify` writes"
+    try:
+        found = Evidence.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; {expected}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the file"
+        raise DataError(f"{path}: {where}: {first['msg']}; {expected}") from error
+    if found.schema_ != SCHEMA:
+        raise DataError(f"{path}: its schema is {found.schema_}; expected {SCHEMA}")
+    return found

@@ -1,0 +1,332 @@
+"""Gathering of the evidence of a fit, or of a calibration, from its runs."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import fdtri
+
+from slipid.data.runs import Runs
+from slipid.data.windows import Windows, incomplete_poses
+from slipid.fitting.calibration.result import Calibration
+from slipid.fitting.shared_effects import AXES
+from slipid.fitting.variances import DEGREES
+from slipid.infer.measured_windows import MeasuredWindows, driving_torque, measured_windows
+from slipid.infer.result import Fit
+from slipid.model.geometry import Geometry
+from slipid.model.robot import Robot
+from slipid.predict import open_loop as replay
+from slipid.predict.kinematics import nominal
+from slipid.predict.predictive import ForceBalance
+from slipid.predict.selection import calibrated_model
+from slipid.predict.slip_model import turned
+from slipid.predict.slip_models import FloorModels
+from slipid.report.html import evidence as ev
+from slipid.support.errors import DataError
+
+MOST_POSES, MOST_REGIONS = 65, 12
+"""Largest numbers of poses, and of regions, that are kept of a run."""
+MOST_DOTS = 6000
+"""Largest number of segments whose wheels become dots; of more, evenly spaced ones are kept."""
+QUARTERS = 4
+"""Number of parts of a run whose errors are shown."""
+TURNS_ON_SPOT = 0.3
+"""Displacement over path length of a quarter below which it has no direction of travel [1]."""
+LEAST_SHARE = 0.3
+"""Smallest speed of a drawn wheel, as a share of that of the fastest wheel: the slip of slower
+wheels is too uncertain."""
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Slip models that predict the runs of a report.
+
+    Attributes:
+        data: runs on one floor each.
+        calibration: calibrated kinematics; None for a fit without them.
+        shape: geometry with the lengths of the config.
+        seen: robot with the pose sensor by which kinematic models are judged.
+        contact: force balance; None for a calibration.
+        selected: name of the selected model, keyed by floor; empty if none was selected.
+    """
+
+    data: Runs
+    calibration: Calibration | None
+    shape: Geometry
+    seen: Robot
+    contact: ForceBalance | None
+    selected: Mapping[str, str]
+
+    @property
+    def kinematic(self) -> list[FloorModels]:
+        """Kinematic models: the lengths of the config, and the calibrated ones, if any."""
+        models = [FloorModels(nominal(self.shape))]
+        if self.calibration is not None:
+            models.append(calibrated_model(self.calibration, self.shape))
+        return models
+
+    def selected_on(self, floor: str) -> str:
+        """Return the name of the model selected on a floor."""
+        usual = "calibrated" if self.contact is None else "contact"
+        return self.selected.get(floor, usual)
+
+
+def evidence_of_fit(fit: Fit, data: Runs) -> ev.Evidence:
+    """Return the evidence of a fit.
+
+    Args:
+        fit: the fit, which may have been loaded from its files.
+        data: its runs on one floor each.
+    """
+    chosen = {floor: one.model for floor, one in fit.selection.items()}
+    models = Predictions(data, fit.calibration, fit.config_shape, fit.seen, fit.contact, chosen)
+    notes: list[str] = []
+    dots: Mapping[str, object] = {}
+    try:
+        dots = _dots(fit, data)
+    except DataError as error:  # a run that is too short to be cut into segments
+        notes.append(f"no slip of single wheels: {error}")
+    found = evidence_of_predictions(models, fit.data_hash, notes)
+    return found.model_copy(update={"correlations": _correlations(fit), **dots})
+
+
+def evidence_of_predictions(
+    models: Predictions, data_hash: str, notes: Sequence[str] = ()
+) -> ev.Evidence:
+    """Return the evidence of predicted runs, without that of a force balance."""
+    data, notes = models.data, list(notes)
+    reason = next(filter(None, (incomplete_poses(data, k) for k in range(len(data)))), None)
+    runs: list[ev.RunEvidence] = []
+    if reason is None:
+        runs = _paths(models)
+    else:
+        notes.append(f"no paths: {reason}")
+    return ev.Evidence(
+        data_hash=data_hash,
+        wheels=_wheels(models.shape),
+        runs=runs,
+        quarters=_quarters(runs, data),
+        notes=notes,
+    )
+
+
+def _wheels(shape: Geometry) -> ev.Wheels:
+    place = np.asarray(shape.place) * float(shape.base_radius)
+    return ev.Wheels(
+        place_m=[(float(x), float(y)) for x, y in place],
+        angle_deg=np.degrees(shape.drive_angle).tolist(),
+        drive=list(shape.drive_of or range(shape.wheels)),
+        radius_m=float(shape.wheel_radius),
+        sideways=bool(shape.determines_twist),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Replay:
+    """Predicted paths of some runs.
+
+    Attributes:
+        w: windows of the runs, one segment each.
+        kept: indices of the poses that are kept of each path.
+        paths: predicted poses (run, edge, 3) of every model, keyed by its name.
+        measured: measured poses (run, edge, 3) by which the selected model is judged.
+        regions: pose index, and scale matrices of the selected model's point (run, 2, 2) there.
+    """
+
+    w: Windows
+    kept: np.ndarray
+    paths: Mapping[str, Float[np.ndarray, "run edge 3"]]
+    measured: Float[np.ndarray, "run edge 3"]
+    regions: Sequence[tuple[int, Float[np.ndarray, "run 2 2"]]]
+
+
+def _paths(models: Predictions) -> list[ev.RunEvidence]:
+    """Return the evidence of all runs in their order."""
+    out: dict[int, ev.RunEvidence] = {}
+    for done in _replayed(models):
+        for n, k in enumerate(done.w.run.tolist()):
+            if k not in out:
+                out[k] = _run(models, done, n, k)
+    return [out[k] for k in sorted(out)]
+
+
+def _replayed(models: Predictions) -> Iterator[_Replay]:
+    """Yield predictions of some runs at a time."""
+    data, contact, seen = models.data, models.contact, models.seen
+    for w in replay.replay_windows(data, seen if contact is None else contact.robot):
+        kept = _spread(w.dt.shape[1] // w.parts, MOST_POSES - 1) * w.parts
+        at = kept[_spread(len(kept) - 1, MOST_REGIONS)][1:]
+        late = w.at_lag(float(seen.camera.lag))
+        paths, regions = {}, []
+        for model in models.kinematic:
+            tracks = replay.tracks_from_increments(seen, w, model.increments(late, seen))
+            paths[model.name] = tracks.predicted
+        measured = tracks.measured
+        if models.calibration is not None:
+            regions = _kinematic_regions(models.calibration, seen, w, tracks, at)
+        if contact is not None:
+            tracks, own = contact.points(w, at.tolist())
+            paths["contact"] = tracks.predicted
+            chosen = np.array([models.selected_on(f) == "contact" for f in w.surface])
+            chosen = chosen[:, None, None]
+            measured = np.where(chosen, tracks.measured, measured)
+            others = regions or own
+            regions = [np.where(chosen, a, b) for a, b in zip(own, others, strict=True)]
+        found = list(zip(at.tolist(), regions, strict=True)) if regions else []
+        yield _Replay(w, kept, paths, measured, found)
+
+
+def _spread(last: int, most: int) -> np.ndarray:
+    """Return at most `most` + 1 evenly spaced indices from 0 to `last`."""
+    return np.unique(np.linspace(0, last, min(last, most) + 1).round().astype(int))
+
+
+def _kinematic_regions(
+    calibration: Calibration, seen: Robot, w: Windows, tracks: replay.Tracks, at: np.ndarray
+) -> list[Float[np.ndarray, "run 2 2"]]:
+    """Return scale matrices of points predicted by calibrated kinematics.
+
+    They contain the noise of poses and motion, and the effects of runs, whose variances include
+    those of the calibrated numbers between runs.
+    """
+    noise = calibration.noise
+    variance = {"camera.place": noise.place**2, "camera.heading": noise.heading**2}
+    for kind, of_floor in (("process", noise.process), ("run", noise.effect)):
+        for floor, stds in of_floor.items():
+            names = (f"{kind}.{floor}.{axis}" for axis in AXES)
+            variance |= {name: std**2 for name, std in zip(names, stds, strict=True)}
+    none = np.zeros((len(w), 3, 3)), np.zeros((len(w), 2, 2))
+    return [replay.path_covariance(seen, w, tracks, variance, *none, edge) for edge in at.tolist()]
+
+
+def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
+    """Return the evidence of the run k, the n-th one of a replay."""
+    data, w, kept = models.data, done.w, done.kept
+    log, selected = data.logs[k], models.selected_on(data.surface[k])
+    time = np.concatenate([[0.0], np.cumsum(w.dt[n])])
+    measured = done.measured[n, :: w.parts, :2]
+    heading, speed = np.degrees(data.heading[k]), data.speed[k]
+    return ev.RunEvidence(
+        name=log.name,
+        floor=data.surface[k],
+        load=log.load,
+        heading_deg=round(float(heading), 1) if np.isfinite(heading) else None,
+        speed=round(float(speed), 3) if np.isfinite(speed) else None,
+        seconds=round(float(time[-1]), 2),
+        path_m=round(float(np.linalg.norm(np.diff(measured, axis=0), axis=1).sum()), 4),
+        time_s=np.round(time[kept], 2).tolist(),
+        measured=_track(done.measured[n, kept]),
+        models={name: _track(path[n, kept]) for name, path in done.paths.items()},
+        region=_region(done, n) if done.regions else None,
+        selected=selected,
+    )
+
+
+def _track(pose: Float[np.ndarray, "edge 3"]) -> ev.Track:
+    x, y, yaw = np.round(1000 * pose).astype(int).T.tolist()
+    return ev.Track(x_mm=x, y_mm=y, yaw_mrad=yaw)
+
+
+def _region(done: _Replay, n: int) -> ev.Region:
+    """Return the 90 % regions of the n-th run of a replay."""
+    factor = np.sqrt(2 * fdtri(2, DEGREES, 0.9))
+    edges, axes, angles = [], [], []
+    for edge, scale in done.regions:
+        square, direction = np.linalg.eigh(scale[n])
+        edges.append(int(np.searchsorted(done.kept, edge)))
+        axes.append(1000 * factor * np.sqrt(np.maximum(square, 0.0)))
+        angles.append(round(1000 * float(np.arctan2(*direction[::-1, 1]))))
+    minor, major = np.round(axes, 1).T.tolist()
+    return ev.Region(edge=edges, major_mm=major, minor_mm=minor, angle_mrad=angles)
+
+
+def _quarters(runs: Sequence[ev.RunEvidence], data: Runs) -> ev.Quarters:
+    """Return the quarters of runs, with the errors of the selected model."""
+    columns: dict[str, list] = {name: [] for name in ev.Quarters.model_fields}
+    for k, run in enumerate(runs):
+        measured, predicted = (_poses(t) for t in (run.measured, run.models[run.selected]))
+        edges = np.linspace(0, len(run.time_s) - 1, QUARTERS + 1).round().astype(int)
+        for i, j in pairwise(edges.tolist()):
+            seconds = run.time_s[j] - run.time_s[i]
+            if seconds <= 0:
+                continue
+            moved = _moved(measured, i, j)
+            off = (_moved(predicted, i, j) - moved) / seconds
+            path = np.linalg.norm(np.diff(measured[i : j + 1, :2], axis=0), axis=1).sum()
+            chord = float(np.hypot(*moved[:2]))
+            ahead = moved[:2] / chord if chord > TURNS_ON_SPOT * path else np.array([1.0, 0.0])
+            moves = chord > TURNS_ON_SPOT * path
+            row = {
+                "run": k,
+                "time_s": round(0.5 * (run.time_s[i] + run.time_s[j]), 2),
+                "seconds": round(seconds, 2),
+                "speed": round(float(path) / seconds, 3),
+                "turn_deg_s": round(float(np.degrees(moved[2])) / seconds, 2),
+                "heading_deg": round(float(np.degrees(np.arctan2(*ahead[::-1]))) % 360, 1)
+                if moves
+                else None,
+                "along_mm_s": round(1000 * float(off[:2] @ ahead), 2),
+                "across_mm_s": round(1000 * float(ahead[0] * off[1] - ahead[1] * off[0]), 2),
+                "yaw_deg_s": round(float(np.degrees(off[2])), 3),
+            }
+            for name, value in row.items():
+                columns[name].append(value)
+    return ev.Quarters(**columns)
+
+
+def _poses(track: ev.Track) -> Float[np.ndarray, "edge 3"]:
+    return np.array([track.x_mm, track.y_mm, track.yaw_mrad]).T / 1000.0
+
+
+def _moved(pose: Float[np.ndarray, "edge 3"], i: int, j: int) -> Float[np.ndarray, "3"]:
+    """Return the increment from pose i to pose j in the frame of pose i [m, m, rad]."""
+    place = turned(-pose[i, 2], pose[j, :2] - pose[i, :2])
+    return np.append(place, pose[j, 2] - pose[i, 2])
+
+
+def _dots(fit: Fit, data: Runs) -> dict[str, object]:
+    """Return the evidence about single wheels: slip and, if they are logged, currents."""
+    measured = measured_windows(fit.robot, data, fit.channels.windows)
+    some = _spread(len(measured.run) - 1, MOST_DOTS - 1)
+    out: dict[str, object] = {"slip": _slip(fit, measured, some)}
+    if measured.amps is not None:
+        start = fit.space.tree(fit.space.start)
+        before = measured_windows(start, data, fit.channels.windows)
+        if len(before.run) == len(measured.run):  # windows cut for another lag may differ
+            out["currents"] = _currents(measured, before, some)
+    return out
+
+
+def _slip(fit: Fit, m: MeasuredWindows, some: np.ndarray) -> ev.WheelDots:
+    fastest = np.abs(m.wheel_speed).max(axis=1, keepdims=True)
+    drawn = (np.abs(m.wheel_speed) > LEAST_SHARE * fastest) & np.isfinite(m.wheel_slip)
+    torque = driving_torque(fit.robot, m) / (m.share * m.share.shape[1])
+    row, drive = np.nonzero(drawn[some])
+    row = some[row]
+    return ev.WheelDots(
+        run=m.run[row].tolist(),
+        drive=drive.tolist(),
+        torque_nm=np.round(torque[row, drive], 4).tolist(),
+        slip=np.round(m.wheel_slip[row, drive], 4).tolist(),
+    )
+
+
+def _currents(m: MeasuredWindows, before: MeasuredWindows, some: np.ndarray) -> ev.CurrentDots:
+    assert m.amps is not None
+    row, drive = np.nonzero(np.isfinite(m.amps[some]))
+    row = some[row]
+    return ev.CurrentDots(
+        run=m.run[row].tolist(),
+        drive=drive.tolist(),
+        measured=np.round(m.amps[row, drive], 4).tolist(),
+        start=np.round(before.amps_model[row, drive], 4).tolist(),
+        fitted=np.round(m.amps_model[row, drive], 4).tolist(),
+    )
+
+
+def _correlations(fit: Fit) -> ev.Correlations:
+    std = np.sqrt(np.diag(fit.covariance))
+    percent = np.round(100 * fit.covariance / np.outer(std, std)).astype(int)
+    return ev.Correlations(names=list(fit.space.names), percent=percent.tolist())

@@ -1,0 +1,157 @@
+"""Results of a fit in a folder, as far as commands have written them so far."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slipid.infer.fit_file import FIT, IDENTIFIED
+from slipid.report.html.evidence import EVIDENCE, Evidence, read_evidence
+from slipid.support.content import Content
+from slipid.support.errors import DataError
+from slipid.support.files import read_json
+
+RESULT = "a result of `slipid identify`"
+DRAWS = "posterior.nc"
+MOST_DRAWS = 1500
+"""Largest number of draws of a posterior that are shown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """Contents of the files in a result folder; None for a file that is absent.
+
+    Attributes:
+        folder: the result folder.
+        identified: content of identified.json.
+        run: content of run.json.
+        fit: content of fit.json; None for a calibration alone.
+        evidence: evidence of the logs.
+        validation, comparison, trial, design, sample: contents of these commands' files.
+        draws: draws of the posterior, keyed by parameter.
+        exports: names of the folders, below the result folder, that `slipid export` wrote.
+        has_robot: True if the folder has robot.json.
+    """
+
+    folder: Path
+    identified: Content
+    run: Content
+    fit: Content | None
+    evidence: Evidence | None
+    validation: Content | None
+    comparison: Content | None
+    trial: Content | None
+    design: Content | None
+    sample: Content | None
+    draws: dict[str, np.ndarray] | None
+    exports: tuple[str, ...]
+    has_robot: bool
+
+    @property
+    def parameters(self) -> Content:
+        """Every parameter with its prior, keyed by path; empty for a calibration alone.
+
+        Values and intervals are those of identified.json, which has those of the posterior, if
+        there is one.
+        """
+        priors = {} if self.fit is None else self.fit["parameters"]
+        return {p: priors.get(p, {}) | e for p, e in self.identified["parameters"].items()}
+
+    @property
+    def calibration(self) -> Content | None:
+        """Section `calibration` of identified.json."""
+        found: Content | None = self.identified.get("calibration")
+        return found
+
+    @property
+    def trust(self) -> Content:
+        """Section `trust` of identified.json; empty for a fit without calibrated kinematics."""
+        found: Content = self.identified.get("trust", {})
+        return found
+
+    @property
+    def floors(self) -> list[str]:
+        """Names of the identified floors."""
+        return list(self.identified["surfaces"])
+
+    @property
+    def selected(self) -> Content:
+        """Name of the selected model, keyed by floor."""
+        found: Content = self.identified.get("selected_model", {})
+        return found
+
+
+def read_results(out: Path) -> Results:
+    """Return the results in a folder.
+
+    Raises:
+        DataError: the folder has no result of `slipid identify`, or a file in it is damaged or
+            belongs to another fit.
+    """
+    identified = _content(out / IDENTIFIED, RESULT)
+    run = _content(out / "run.json", RESULT)
+    for key in ("parameters", "surfaces", "data", "messages"):
+        if key not in identified:
+            raise DataError(f"{out / IDENTIFIED}: no '{key}'; expected {RESULT}")
+    evidence = read_evidence(out / EVIDENCE) if (out / EVIDENCE).exists() else None
+    if evidence is not None and evidence.data_hash != identified["data"]["hash"]:
+        raise DataError(
+            f"{out / EVIDENCE}: of other logs than {IDENTIFIED} beside it; run `slipid identify` "
+            "again"
+        )
+    return Results(
+        folder=out,
+        identified=identified,
+        run=run,
+        fit=_maybe(out / FIT),
+        evidence=evidence,
+        validation=_maybe(out / "validation.json"),
+        comparison=_maybe(out / "comparison.json"),
+        trial=_maybe(out / "trial.json"),
+        design=_maybe(out / "design.json"),
+        sample=_maybe(out / "sample.json"),
+        draws=_draws(out / DRAWS) if (out / DRAWS).exists() else None,
+        exports=tuple(sorted(p.parent.name for p in out.glob("*/SHA256SUMS"))),
+        has_robot=(out / "robot.json").exists(),
+    )
+
+
+def _content(path: Path, what: str) -> Content:
+    found = read_json(path, what)
+    if not isinstance(found, dict):
+        raise DataError(f"{path}: expected {what}")
+    return found
+
+
+def _maybe(path: Path) -> Content | None:
+    """Return the content of a JSON file, or None if it is absent."""
+    return _content(path, "the result of a command of slipid") if path.exists() else None
+
+
+def _draws(path: Path) -> dict[str, np.ndarray] | None:
+    """Return the draws of scalar parameters in posterior.nc, keyed by path, chain after chain.
+
+    Returns:
+        None if h5py, which reads the file, is not installed.
+    """
+    try:
+        import h5py
+    except ImportError:
+        return None
+    found: dict[str, np.ndarray] = {}
+    try:
+        with h5py.File(path) as file:
+            group: Any = file["posterior"]
+            floors = [name.decode() for name in group["surface"][:]]
+            for name, values in group.items():
+                part, _, rest = name.partition(".")
+                if values.ndim == 2 and part in ("motor", "camera", "robot"):
+                    found[name] = np.asarray(values, float).ravel()
+                elif values.ndim == 3 and part == "surface" and values.shape[2] == len(floors):
+                    for k, floor in enumerate(floors):
+                        found[f"surface.{floor}.{rest}"] = np.asarray(values[:, :, k]).ravel()
+    except (OSError, KeyError, AttributeError) as error:
+        raise DataError(f"{path}: {error}; expected draws of `slipid sample`") from error
+    step = max(1, *(len(x) // MOST_DRAWS for x in found.values())) if found else 1
+    return {name: x[::step] for name, x in found.items()}

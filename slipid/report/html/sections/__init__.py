@@ -1,0 +1,1 @@
+"""Sections of the page of a fit; each returns None if the results have nothing for it."""

@@ -1,0 +1,133 @@
+"""Sections about what follows a fit: trial, further runs, comparison with others, provenance."""
+
+from slipid.report.html import figures as draw
+from slipid.report.html.blocks import Block, Code, Figure, Section, Table, Text
+from slipid.report.html.results import Results
+
+
+def trial(found: Results) -> Section | None:
+    """Return the section about the trial of controllers in simulation."""
+    t = found.trial
+    if t is None:
+        return None
+    names = sorted(t["summary"], key=lambda n: -t["summary"][n]["closure_error_median"])
+    data = []
+    for k, name in enumerate(names):
+        row = t["summary"][name]
+        middle = row["closure_error_median"]
+        low, high = row["interval90"]["closure_error_median"]
+        shade = "@orange" if name == "encoder" else draw.SERIES[0]
+        trace = draw.dots([middle], [k], name, shade, marker={"size": 10, "opacity": 1})
+        trace["error_x"] = {
+            "type": "data",
+            "symmetric": False,
+            "array": [high - middle],
+            "arrayminus": [middle - low],
+            "color": shade,
+        }
+        trace["hovertemplate"] = "%{x:.0f} mm<extra>%{fullData.name}</extra>"
+        data.append(trace)
+    title = t["verdict"][0].upper() + t["verdict"][1:]
+    layout = {
+        "xaxis": draw.axis(
+            "distance from the start after the closed path [mm]", rangemode="tozero"
+        ),
+        "yaxis": {"automargin": True, "tickvals": list(range(len(names))), "ticktext": names},
+        "showlegend": False,
+    }
+    runs = min(row["runs"] for row in t["summary"].values())
+    caption = (
+        f"Medians of {runs} starts, with 90 % intervals; {t['path']} at {t['speed_m_s']:g} m/s."
+    )
+    figure = Figure("trial_errors", title, title, data, layout, caption, 130 + 34 * len(names))
+    rows = [
+        (
+            t["controllers"].get(n, n),
+            f"{t['summary'][n]['closure_error_median']:.0f}",
+            f"{t['summary'][n]['cross_track_rmse']:.0f}",
+            f"{t['summary'][n]['heading_error_deg']:.1f}",
+            f"{100 * t['summary'][n]['finished_share']:.0f}",
+        )
+        for n in reversed(names)
+    ]
+    head = ("controller", "closure [mm]", "cross-track [mm]", "heading [deg]", "finished [%]")
+    plant = "the fitted model itself" if t["plant"] == "twin" else "a robot in a physics engine"
+    about = f"Errors of the controllers; the simulated robot is {plant}."
+    return Section(
+        "trial", "Trial of controllers", [figure, Table(about, head, rows, right=head[1:])]
+    )
+
+
+def design(found: Results) -> Section | None:
+    """Return the section with the runs to drive next."""
+    d = found.design
+    if d is None or not d["runs"]:
+        return None
+    rows = [
+        (
+            str(k),
+            run["floor"],
+            run["load"],
+            f"{run['heading_deg']:.0f} deg" if run["speed"] else "",
+            f"{run['speed']:g}" if run["speed"] else "",
+            f"{run['turn_rate']:.2f}" if run["turn_rate"] else "",
+            f"{run['seconds']:.1f}",
+        )
+        for k, run in enumerate(d["runs"], start=1)
+    ]
+    head = ("run", "floor", "load", "direction", "speed [m/s]", "turn [rad/s]", "seconds")
+    about = "Runs that narrow the intervals most, in the order in which to drive them."
+    blocks: list[Block] = [Table(about, head, rows, right=head[4:])]
+    if d["messages"]:
+        blocks.append(Text(d["messages"], listed=True, kind="note"))
+    return Section("design", "What to drive next", blocks)
+
+
+def provenance(found: Results) -> Section:
+    """Return the section about the origin of the results, and the commands that follow."""
+    run, out = found.run, found.folder
+    config, data = run["config"], run["data"]
+    rows = [
+        ("finished", str(run["finished"])),
+        ("duration of the fit", f"{run['seconds']:.0f} s"),
+        ("config", f"{config['name']}, SHA-256 {config['sha256'][:16]}"),
+        ("logs", f"{len(data['logs'])} runs, hash {data['hash'][:16]}"),
+        ("seed", str(run.get("seed", ""))),
+        ("versions", ", ".join(f"{k} {v}" for k, v in run.get("versions", {}).items())),
+    ]
+    if found.fit is not None:
+        ended = "converged" if found.fit["converged"] else "did NOT converge"
+        rows.append(("optimisation", f"{ended}: {found.fit['reason']}"))
+    blocks: list[Block] = [Table("Where these results come from.", ("what", "value"), rows)]
+    kind = "" if found.fit is not None else " --only calibration"
+    blocks.append(
+        Code(
+            "To repeat it",
+            f"slipid identify {out.name}/config.toml --data LOGS --out {out.name}{kind}",
+        )
+    )
+    lines = [f"{sentence:42}# {why}" for sentence, why in _next(found)]
+    blocks.append(Code("What you can do next", "\n".join(lines)))
+    files = ["robot.json"] if found.has_robot else []
+    files += [f"{name}/" for name in found.exports]
+    if files:
+        blocks.append(Text([f"Files to deploy: {', '.join(files)}."]))
+    return Section("provenance", "Provenance and next steps", blocks)
+
+
+def _next(found: Results) -> list[tuple[str, str]]:
+    """Return commands that add to the results, each with its purpose."""
+    name, out = found.folder.name, []
+    fitted = found.fit is not None
+    if found.validation is None:
+        out.append((f"slipid validate {name} --data OTHER", "predict runs that were not fitted"))
+    if found.sample is None and fitted:
+        out.append((f"slipid sample {name}", "posterior by emcee"))
+    if found.design is None and fitted:
+        out.append((f"slipid design {name}", "which runs to drive next"))
+    if found.trial is None and found.has_robot:
+        out.append((f"slipid trial {name}", "compare controllers in simulation"))
+    if not found.exports and found.has_robot:
+        out.append((f"slipid export {name} --out to_go", "C99, ROS 2, StableHLO, tables"))
+    out.append((f"slipid report {name}", "this page again, with what was added"))
+    return out

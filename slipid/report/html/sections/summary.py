@@ -1,0 +1,379 @@
+"""Sections about the verdict, the numbers to type into a robot, and all values with intervals."""
+
+from collections.abc import Iterator, Sequence
+
+from slipid.infer.verdicts.trust import WORDS
+from slipid.report.html.blocks import (
+    Badge,
+    Block,
+    Cell,
+    Code,
+    Figure,
+    Section,
+    Table,
+    Text,
+    badge,
+    enumerated,
+    interval,
+    label,
+    number,
+)
+from slipid.report.html.figures import axis, dots
+from slipid.report.html.results import Results
+from slipid.support.content import Content
+
+MOST_NOTES = 5
+"""Largest number of notes beside the verdict; further ones are in the section on data quality."""
+USE = {
+    WORDS[0]: "Use it on the floors below: no simpler model predicts held-out runs better.",
+    WORDS[1]: "Use it with care, and read the reasons first.",
+    WORDS[2]: "Do not deploy it as it is. The calibrated lengths below may still be useful.",
+}
+"""What a result may be used for, keyed by the level of trust."""
+
+
+def verdict(found: Results) -> Section:
+    """Return the section with the verdict in one line, and what the result may be used for."""
+    word = found.trust.get("verdict")
+    blocks: list[Block] = []
+    if word is None:
+        converged = found.fit is not None and found.fit["converged"]
+        word = "converged" if converged else "not converged"
+        blocks.append(Text([f"The fit has {word}. It has no verdict of trust."]))
+    else:
+        blocks.append(Text([f"{word[0].upper()}{word[1:]}. {USE[word]}"], kind=badge(word).kind))
+        if reasons := found.trust["reasons"]:
+            blocks.append(Text(reasons, listed=True, kind="warning"))
+        blocks.append(_floors(found))
+    notes = ranked_notes(found)
+    if notes:
+        blocks.append(Text(notes[:MOST_NOTES], listed=True, kind="note"))
+    return Section("verdict", "Verdict", blocks)
+
+
+def ranked_notes(found: Results) -> list[str]:
+    """Return the notes on a result, the most important first."""
+    remedies = set() if found.fit is None else {f["remedy"] for f in found.fit["flat"]}
+    others = [  # those about directions without information have sections of their own
+        m for m in found.identified["messages"] if not any(m.endswith(f": {r}") for r in remedies)
+    ]
+    return [*found.trust.get("notes", ()), *others]
+
+
+def _floors(found: Results) -> Table:
+    """Return a table of the floors with the selected model and its error."""
+    rows: list[Sequence[Cell]] = []
+    for floor, errors in found.trust["held_out_error_over_path"].items():
+        chosen = found.selected[floor]
+        nominal = errors.get("nominal")
+        rows.append(
+            (
+                floor,
+                label(chosen),
+                percent(errors[chosen]),
+                "" if nominal is None else percent(nominal),
+                str(found.trust["runs"][floor]),
+            )
+        )
+    caption = (
+        "Model selected on each floor, and how far it and the lengths of the config are off on "
+        "held-out runs, as a share of the path length."
+    )
+    head = ("floor", "selected model", "error", "with the config's lengths", "runs")
+    return Table(caption, head, rows, right=("error", "with the config's lengths", "runs"))
+
+
+def percent(value: float) -> str:
+    """Return a fraction as text in percent."""
+    return f"{100 * value:.2g} %" if value < 0.1 else f"{100 * value:.0f} %"
+
+
+def numbers(found: Results) -> Section | None:
+    """Return the section with the numbers to type into a robot."""
+    lines = [*_calibrated_lines(found), *_motor_lines(found)]
+    if not lines:
+        return None
+    name = found.run["config"]["name"]
+    text = "\n".join([f"# {name}, by slipid {_version(found)}; 90 % intervals", *lines])
+    about = Text(
+        [
+            "Lengths are effective ones: with them, odometry without a slip model is right on "
+            "average on that floor. Multipliers are ratios to the lengths of the config, as "
+            "drive controllers of ROS take them."
+        ]
+    )
+    blocks: list[Block] = [about, Code("Numbers to type in", text)]
+    return Section("numbers", "Type these numbers into your robot", blocks)
+
+
+def _version(found: Results) -> str:
+    return str(found.run.get("versions", {}).get("slipid", ""))
+
+
+def _calibrated_lines(found: Results) -> Iterator[str]:
+    """Yield lines about calibrated lengths and the pose sensor, floor by floor."""
+    c = found.calibration
+    if c is None:
+        return
+    for floor, one in c["surfaces"].items():
+        yield f"\n# floor: {floor}"
+        radii = one["rolling_radius_m"]
+        for name, value in zip(
+            drive_names(len(radii), bool(c.get("steering"))), radii, strict=False
+        ):
+            yield _line(f"{name}wheel_radius_m", value)
+        for key in ("effective_track_m", "effective_base_m"):
+            if key in one:
+                name = "wheelbase_m" if c.get("steering") else key
+                yield _line(name, one[key])
+        if floor in c["centre_of_rotation_m"]:
+            centre = c["centre_of_rotation_m"][floor]
+            if centre["verdict"] != "fixed":
+                yield _line("centre_of_rotation_ahead_m", centre)
+        multipliers = c["multipliers"][floor]
+        for name, value in zip(
+            drive_names(len(radii), False), multipliers["wheel_radius"], strict=False
+        ):
+            yield f"{name}wheel_radius_multiplier: {value:.5f}"
+        length = "wheel_separation" if len(radii) == 2 else "base"
+        yield f"{length}_multiplier: {multipliers['track']:.5f}"
+    yield "\n# pose sensor"
+    ahead, left = c["pose_offset_m"]
+    yield _line("pose_sensor_ahead_m", ahead)
+    yield _line("pose_sensor_left_m", left)
+    yield _line("pose_sensor_yaw_rad", c["pose_yaw_rad"])
+    yield _line("pose_lag_s", c["pose_lag_s"])
+    for name in ("gyro_scale", "gyro_bias_rad_s"):
+        if name in c:
+            yield _line(name, c[name])
+    for name, value in c.get("steering", {}).items():
+        if name != "wheelbase_m":
+            yield _line(f"steering_{name}", value)
+
+
+def drive_names(count: int, steered: bool) -> list[str]:
+    """Return the prefix of the name of each drive."""
+    if steered:
+        return [""]
+    return ["left_", "right_"] if count == 2 else [f"drive_{k + 1}_" for k in range(count)]
+
+
+MOTOR = {
+    "motor.resistance": "motor_resistance_ohm",
+    "motor.back_emf": "motor_back_emf_v_s_per_rad",
+    "motor.coulomb_friction": "motor_coulomb_friction_n_m",
+    "motor.viscous_friction": "motor_viscous_friction_n_m_s_per_rad",
+}
+"""Name of each number of a motor to type in, keyed by path."""
+
+
+def _motor_lines(found: Results) -> Iterator[str]:
+    """Yield lines about the motor; numbers that the logs do not determine are comments."""
+    known = {p: found.parameters[p] for p in MOTOR if p in found.parameters}
+    if known:
+        yield "\n# motor (at its shaft)"
+    for path, value in known.items():
+        hidden = value["verdict"] in ("not_identified", "at_bound", "fixed")
+        yield ("# " if hidden else "") + _line(MOTOR[path], value)
+
+
+def _line(name: str, value: Content) -> str:
+    """Return a line with a number, its interval and, if it is not good, its verdict."""
+    ends = value["interval90"]
+    text = f"{name}: {number(value['value'], 5)}"
+    comments = []
+    if ends is not None and ends[0] != ends[1]:
+        comments.append(interval(ends, 5))
+    if value["verdict"] != "identified":
+        comments.append(value["verdict"].replace("_", " "))
+    return f"{text}  # {'; '.join(comments)}" if comments else text
+
+
+def values(found: Results) -> Section | None:
+    """Return the section with all values, intervals and priors, and what to do about weak ones."""
+    blocks: list[Block] = []
+    if (calibration := found.calibration) is not None:
+        blocks.append(calibration_table(calibration))
+    rows = list(_rows(found, fixed=False))
+    if rows:
+        head = ("parameter", "value", "unit", "90 % interval", "prior", "verdict", "meaning")
+        caption = (
+            f"Parameters of the force balance: {_counts(found)}. The prior is what was known "
+            "before the logs, as mean and standard deviation."
+        )
+        blocks.append(Table(caption, head, rows, right=("value",)))
+        if (figure := _narrowing(found)) is not None:
+            blocks.append(figure)
+        blocks += _remedies(found)
+        fixed = list(_rows(found, fixed=True))
+        if fixed:
+            caption = "Values that were given or have the default, and were not fitted."
+            blocks.append(Table(caption, head, fixed, right=("value",), folded=True))
+    return Section("values", "Values and intervals", blocks) if blocks else None
+
+
+def _counts(found: Results) -> str:
+    """Return how many parameters have each verdict."""
+    words = [e["verdict"] for e in found.parameters.values() if e["verdict"] != "fixed"]
+    names = ("identified", "weak", "disputed", "not_identified", "at_bound")
+    return enumerated([f"{words.count(w)} {w.replace('_', ' ')}" for w in names if w in words])
+
+
+def calibration_table(c: Content) -> Table:
+    """Return the table of calibrated numbers."""
+    rows: list[Sequence[Cell]] = []
+
+    def row(name: str, value: Content) -> None:
+        factor, unit = (1000.0, "mm") if value["unit"] == "m" else (1.0, value["unit"])
+        ends = [factor * end for end in value["interval90"]]
+        shown = "" if value["verdict"] == "fixed" else interval(ends, 5)
+        rows.append(
+            (name, number(factor * value["value"], 5), unit, shown, badge(value["verdict"]))
+        )
+
+    steered = bool(c.get("steering"))
+    for floor, one in c["surfaces"].items():
+        radii = one["rolling_radius_m"]
+        for name, value in zip(drive_names(len(radii), steered), radii, strict=False):
+            row(f"{floor}: rolling radius {name.replace('_', ' ').strip()}".strip(), value)
+        for key in ("effective_track_m", "effective_base_m"):
+            if key in one:
+                row(f"{floor}: {'wheelbase' if steered else key[:-2].replace('_', ' ')}", one[key])
+    row("pose sensor ahead of the middle", c["pose_offset_m"][0])
+    row("pose sensor left of the middle", c["pose_offset_m"][1])
+    row("yaw of the pose sensor", c["pose_yaw_rad"])
+    row("lag of the poses", c["pose_lag_s"])
+    if c["pose_scale"]["verdict"] != "fixed":
+        row("true over logged length", c["pose_scale"])
+    for name, text in (
+        ("gyro_scale", "true over measured yaw rate"),
+        ("gyro_bias_rad_s", "bias of the gyro"),
+    ):
+        if name in c:
+            row(text, c[name])
+    head = ("calibrated number", "value", "unit", "90 % interval", "verdict")
+    caption = "Calibrated kinematics and pose sensor: what odometry without a slip model needs."
+    return Table(caption, head, rows, right=("value",))
+
+
+def _rows(found: Results, fixed: bool) -> Iterator[Sequence[Cell]]:
+    """Yield a row of each parameter, or of each element of a vector."""
+    for path, e in found.parameters.items():
+        if "session_yaw" in path or (e["verdict"] == "fixed") != fixed:
+            continue
+        for k, name in enumerate(e["labels"] or [""]):
+
+            def part(x: object, k: int = k, vector: bool = bool(e["labels"])) -> object:
+                return x[k] if vector and isinstance(x, list) else x
+
+            mean, std = part(e.get("prior_mean")), part(e.get("prior_std"))
+            prior = ""
+            if isinstance(mean, float) and isinstance(std, float):
+                prior = f"{number(mean, 3)} ± {number(std, 2)}"
+            yield (
+                f"{path} [{name}]" if name else path,
+                number(part(e["value"])),  # type: ignore[arg-type]
+                e["unit"],
+                interval(part(e["interval90"]), 3),  # type: ignore[arg-type]
+                prior,
+                badge(e["verdict"]) if k == 0 else Badge(""),
+                e.get("doc", "") if k == 0 else "",
+            )
+
+
+def _narrowing(found: Results) -> Figure | None:
+    """Return the figure of how much the logs narrowed each number."""
+    shown = {
+        p: e["ratio"]
+        for p, e in found.parameters.items()
+        if e.get("ratio") is not None and "session_yaw" not in p
+    }
+    if not shown:
+        return None
+    order = sorted(shown, key=lambda p: shown[p])
+    width = [max(min(shown[p], 1.0), 1e-3) for p in order]
+    kinds = {
+        "good": ("identified", "@blue", "circle"),
+        "weak": ("weak or disputed", "@orange", "square"),
+        "bad": ("not identified or at bound", "@muted", "x"),
+    }
+    data = []
+    for kind, (name, shade, symbol) in kinds.items():
+        mine = [
+            k for k, p in enumerate(order) if badge(found.parameters[p]["verdict"]).kind == kind
+        ]
+        if mine:
+            data.append(
+                dots(
+                    [width[k] for k in mine],
+                    [order[k] for k in mine],
+                    name,
+                    shade,
+                    marker={"size": 9, "opacity": 1, "symbol": symbol},
+                    hovertemplate="%{y}: %{x:.3g} of the prior's width<extra></extra>",
+                )
+            )
+    good = sum(found.parameters[p]["verdict"] == "identified" for p in order)
+    layout = {
+        "xaxis": axis(
+            "width of the interval over that of the prior",
+            type="log",
+            tickvals=[0.001, 0.01, 0.1, 1],
+            ticktext=["1/1000", "1/100", "1/10", "1 (nothing learnt)"],
+        ),
+        "yaxis": {
+            "automargin": True,
+            "categoryorder": "array",
+            "categoryarray": order[::-1],
+            "tickfont": {"size": 10},
+        },
+        "showlegend": True,
+        "shapes": [
+            {
+                "type": "line",
+                "x0": 1,
+                "x1": 1,
+                "y0": 0,
+                "y1": 1,
+                "yref": "paper",
+                "line": {"color": "@muted", "dash": "dot"},
+            }
+        ],
+    }
+    title = f"The logs determine {good} of {len(order)} parameters"
+    alt = f"{title}. Dots show the width of each parameter's interval over that of its prior."
+    return Figure(
+        "narrowing",
+        title,
+        alt,
+        data,
+        layout,
+        "Further left: more learnt from the logs.",
+        110 + 17 * len(order),
+        minimum=420,
+    )
+
+
+def _remedies(found: Results) -> list[Block]:
+    """Return what to do about parameters that the logs do not determine well."""
+    if found.fit is None:
+        return []
+    unknown: dict[str, list[str]] = {}
+    for flat in found.fit["flat"]:
+        if flat["remedy"]:
+            paths = unknown.setdefault(flat["remedy"], [])
+            paths += [p for p in flat["paths"] if p not in paths]
+    out = [f"{remedy}: for {enumerated(paths)}" for remedy, paths in unknown.items()]
+    weak = [p for p, e in found.parameters.items() if e["verdict"] == "weak"]
+    if weak:
+        command = f"slipid design {found.folder.name}"
+        out.append(
+            f"run `{command}`, which proposes the runs that narrow them most: for "
+            f"{enumerated(weak)}, which are weak"
+        )
+    if not out:
+        return []
+    return [
+        Text(["What to do about numbers that are weak or not identified:"]),
+        Text(out, listed=True),
+    ]
