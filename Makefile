@@ -69,9 +69,9 @@ clean: ## remove the environment, the caches and demo_out (never out/)
 	rm -rf demo_out build dist *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The demo needs the library only; tests and checks need the tools too.
+# The demo needs the library with all of its extras; tests and checks need the tools too.
 $(VENV)/.run-stamp: pyproject.toml
-	$(call install,.)
+	$(call install,.[all])
 	@touch $@
 
 $(VENV)/.dev-stamp: pyproject.toml

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     made_runs, move = simulate_runs, steady_motion
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 _ROOMS = {
     "Controller": "slipid.robot.controller",
     "DataError": "slipid.support.errors",

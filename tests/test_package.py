@@ -12,6 +12,17 @@ import pytest
 
 import slipid
 
+EXTRA = (
+    *("matplotlib", "plotly", "jinja2", "rosbags", "pyarrow", "pyulog", "mcap", "cv2", "mujoco"),
+    *("emcee", "arviz_base", "arviz_stats", "arviz_plots", "xarray", "h5netcdf", "h5py", "sklearn"),
+)
+"""Packages that extras install."""
+DRAW_OR_SAMPLE = {
+    "slipid.app.sample",
+    *(f"slipid.infer.posterior.{name}" for name in ("ensemble", "proposals", "sample")),
+    *(f"slipid.lab.{name}" for name in ("benchmark.report", "paper2021.plots", "trial.plots")),
+}
+"""Modules outside `slipid.plots` that need such a package: commands look for it before."""
 HEAVY = ["jax", "equinox", "optimistix", "scipy", "matplotlib", "pydantic", "pint", "typer", "rich"]
 
 
@@ -35,24 +46,30 @@ def test_import_is_light_and_silent():
 
 @pytest.mark.slow
 def test_all_but_extras_runs_without_their_libraries():
-    """What `pip install slipid` brings is enough to identify, deploy and run the demo."""
-    rooms = (
-        *(
-            "cli.demo",
-            "app.identify",
-            "app.compare",
-            "infer.posterior.diagnosis",
-        ),
-        *("deploy.deploy", "lab.trial.trial", "api.fit", "api.robot", "plots.fit"),
-    )
-    code = (
-        "import sys\nfrom importlib import import_module\n"
-        "for extra in ('emcee', 'arviz_stats', 'xarray', 'h5netcdf', 'mujoco', 'cv2', 'pyarrow'):\n"
-        "    sys.modules[extra] = None\n"
-        f"for room in {rooms!r}: import_module('slipid.' + room)"
-    )
+    """Every module but those that draw and sample needs no more than `pip install slipid`."""
+    code = f"""if True:
+        import json, sys
+        from importlib import import_module
+        from pkgutil import walk_packages
+
+        for package in {EXTRA!r}:
+            sys.modules[package] = None
+        import slipid
+
+        absent = {{}}
+        for module in walk_packages(slipid.__path__, "slipid.", onerror=lambda name: None):
+            if not module.name.endswith("__main__"):
+                try:
+                    import_module(module.name)
+                except ImportError as error:
+                    absent[module.name] = str(error)
+        print(json.dumps(absent))
+    """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    absent = json.loads(done.stdout)
+    assert {name for name in absent if not name.startswith("slipid.plots")} == DRAW_OR_SAMPLE
+    assert "install" in absent["slipid.plots"]  # the command to type
 
 
 def test_xla_gets_only_flags_that_it_knows_and_that_are_not_set(monkeypatch):

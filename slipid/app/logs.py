@@ -19,8 +19,23 @@ from slipid.data.runs import Runs, collect, counted_once
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
-from slipid.support.files import write_bytes, write_json
+from slipid.support.files import read_json, write_bytes, write_json
 from slipid.support.progress import Reporter
+
+
+def log_folder(out: Path, data: Path | None) -> Path:
+    """Return the folder of the logs: the given one, else the folder from which the fit read them.
+
+    Raises:
+        DataError: the folder of the fit no longer exists.
+    """
+    if data is not None:
+        return data
+    run = read_json(out / "run.json", "the run.json that `slipid identify` writes")
+    folder = Path(run["data"]["folder"])
+    if not folder.is_dir():
+        raise DataError(f"{folder}: the folder of the fitted logs is gone; expected --data DIR")
+    return folder
 
 
 def read_dataset(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.app.config import read_config
+from slipid.app.logs import log_folder
 from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.infer.fit_file import load, write_identified
 from slipid.infer.posterior import sample as netcdf
@@ -17,7 +18,7 @@ from slipid.infer.result import Fit
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import read_json, write_json
+from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -96,21 +97,6 @@ def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
         },
         "versions": versions(),
     }
-
-
-def log_folder(out: Path, data: Path | None) -> Path:
-    """Return the folder of the logs: the given one, else the folder from which the fit read them.
-
-    Raises:
-        DataError: the folder of the fit no longer exists.
-    """
-    if data is not None:
-        return data
-    run = read_json(out / "run.json", "the run.json that `slipid identify` writes")
-    folder = Path(run["data"]["folder"])
-    if not folder.is_dir():
-        raise DataError(f"{folder}: the folder of the fitted logs is gone; expected --data DIR")
-    return folder
 
 
 def _refuse_mixed(fit: Fit) -> None:

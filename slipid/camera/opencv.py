@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from slipid.support.errors import DataError, did_you_mean
+from slipid.support.extras import missing
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """File suffixes by which images are recognised in folders and next to videos; an image file that a
@@ -37,9 +38,7 @@ def _opencv() -> ModuleType:
     try:
         import cv2
     except ImportError as error:
-        raise DataError(
-            f"images need OpenCV ({error}); expected: pip install 'slipid[camera]'"
-        ) from error
+        raise missing("camera", "an image", error) from error
     if not hasattr(getattr(cv2, "aruco", None), "CharucoDetector"):
         raise DataError(
             f"OpenCV {cv2.__version__} has no marker detector; expected version 4.8 or newer of "

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, flag, guarded, option
+from slipid.support.extras import require
 from slipid.support.progress import Reporter
 
 
@@ -31,6 +32,8 @@ def benchmark(
     methods. Writes benchmark.json and benchmark.html. After an interrupt, finished parts are not
     computed again. The exit code is 1 if anything failed.
     """
+    require("sklearn", "benchmark", "`slipid benchmark`")
+    require("matplotlib", "benchmark", "`slipid benchmark`")
     from slipid.lab.benchmark.benchmark import benchmark as run
     from slipid.lab.benchmark.report import benchmark_pictures, show_benchmark, write_page
     from slipid.lab.benchmark.work import BenchmarkOptions
@@ -65,6 +68,7 @@ def paper(
     out: Out,
 ) -> int:
     """Regenerate the tables and figures of the 2021 paper from the paper's data."""
+    require("matplotlib", "report", "`slipid paper`")
     from slipid.lab.paper2021.plots import run
 
     for path in run(data, out):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Quiet, emit, flag, guarded, option
+from slipid.cli.common import Json, Quiet, can_draw, emit, flag, guarded, option
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -130,8 +130,7 @@ def calibrate(
                     f"--board-height {board_height:g}; expected a height in metres, 0 or more"
                 )
             fit = floor_from_board(lens, seen, floor, board_height, std)
-        report.stage("writing")
-        return _write(lens, fit, out, json)
+        return _write(lens, fit, out, json, report)
 
 
 def _refuse_combinations(
@@ -203,21 +202,25 @@ def _uncalibrated(
     return 0
 
 
-def _write(lens: "CalibratedLens", fit: "FloorFit | None", out: Path, json: str | None) -> int:
+def _write(
+    lens: "CalibratedLens", fit: "FloorFit | None", out: Path, json: str | None, report: Reporter
+) -> int:
     """Write the camera and its pictures, print the report, and return the exit code."""
-    from slipid.plots.calibration import coverage_picture, floor_picture
     from slipid.support.files import read_json, write_json
 
     files = [out]
     write_json(out, lens.to_json() if fit is None else fit.camera.to_json())
-    if lens.quality is not None:
-        files.append(coverage_picture(lens.quality, out.with_name(f"{out.stem}_coverage.png")))
-    if fit is not None:
-        files.append(floor_picture(fit, out.with_name(f"{out.stem}_floor.png")))
+    if can_draw(report):
+        from slipid.plots.calibration import coverage_picture, floor_picture
+
+        if lens.quality is not None:
+            files.append(coverage_picture(lens.quality, out.with_name(f"{out.stem}_coverage.png")))
+        if fit is not None:
+            files.append(floor_picture(fit, out.with_name(f"{out.stem}_floor.png")))
     content = read_json(out, "the camera file that was just written")
-    report, fresh, names = content["report"], lens.quality is not None, [f.name for f in files]
-    emit(json, content, lambda page: _show(page, report, fresh), out.parent, names)
-    return 1 if report.get("poor") else 0
+    about, fresh, names = content["report"], lens.quality is not None, [f.name for f in files]
+    emit(json, content, lambda page: _show(page, about, fresh), out.parent, names)
+    return 1 if about.get("poor") else 0
 
 
 def _show(page: "Page", report: Content, lens_too: bool = True) -> None:

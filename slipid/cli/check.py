@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, emit, guarded
+from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, can_draw, emit, guarded
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -33,14 +33,14 @@ def check(
     with Reporter(quiet=quiet) as report:
         logs, found = checks.check(config, data, out, report)
         if out is not None:
-            from slipid.plots.fit import raw_plots
             from slipid.report.html.check_page import check_page
             from slipid.report.html.page import try_page
 
-            report.stage("drawing")
-            drawn = [path.name for path in raw_plots(logs, out)]
-            page = try_page(check_page(logs, found, config.name), out, report)
-            written = (*page, "check.json", *drawn)
+            written = (*try_page(check_page(logs, found, config.name), out, report), "check.json")
+            if can_draw(report):
+                from slipid.plots.fit import raw_plots
+
+                written += tuple(path.name for path in raw_plots(logs, out))
     emit(json, found, lambda page: show_check(page, found), out, written)
     return 1 if any(f["severity"] == "wrong" for f in found["findings"]) else 0
 
@@ -54,13 +54,13 @@ def bench(config: "Config", data: Path, out: Path | None, json: str | None, quie
     with Reporter(quiet=quiet) as report:
         fit, found = check_bench(config, data, out, report)
         if out is not None:
-            from slipid.plots.bench import bench_plots
             from slipid.report.html.bench_page import bench_page
             from slipid.report.html.page import try_page
 
-            report.stage("drawing")
-            drawn = [path.name for path in bench_plots(fit, out)]
-            page = try_page(bench_page(fit, config.path.name), out, report)
-            written = (*page, "check.json", *drawn)
+            written = (*try_page(bench_page(fit, config.path.name), out, report), "check.json")
+            if can_draw(report):
+                from slipid.plots.bench import bench_plots
+
+                written += tuple(path.name for path in bench_plots(fit, out))
     emit(json, found, lambda page: show_bench_check(page, found), out, written)
     return 0

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from slipid.report.page import Page
+    from slipid.support.progress import Reporter
 
 
 def option(
@@ -74,6 +75,22 @@ def executor_of(jobs: int | None) -> "Executor":
 
     count = jobs or os.cpu_count() or 1
     return InProcess() if count == 1 else Processes(count)
+
+
+def can_draw(report: "Reporter") -> bool:
+    """Begin the stage of drawing; return False if pictures cannot be drawn, which a line explains.
+
+    A command writes its other results without the package that draws.
+    """
+    from slipid.support.extras import MissingExtra, require
+
+    try:
+        require("matplotlib", "report", "a picture")
+    except MissingExtra as error:
+        report.line(f"all pictures are left out: {error}")
+        return False
+    report.stage("drawing")
+    return True
 
 
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
+from slipid.cli.common import Json, OutFolder, Quiet, can_draw, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -74,20 +74,17 @@ def design(
         report.stage("simulating candidate runs")
         scope = Scope(fit, *goals, runs, headings, speeds, turns, distance, *places)
         found = proposal.design(scope)
-        report.stage("drawing")
-        written = write(found, out)
+        written = write(found, out, report)
     emit(json, found.content, lambda page: show_design(page, found.content), out, written)
     return 0 if found.reachable else 1
 
 
-def write(found: "Design", out: Path) -> list[str]:
+def write(found: "Design", out: Path, report: Reporter) -> list[str]:
     """Write a design to a folder, and return the names of the files.
 
     If the design proposes no runs, the files of an earlier design are removed.
     """
     from slipid.infer.design.proposal import commands
-    from slipid.plots.design import design_figure
-    from slipid.plots.drawing import save
     from slipid.support.files import write_bytes, write_json
 
     write_json(out / "design.json", found.content)
@@ -97,5 +94,10 @@ def write(found: "Design", out: Path) -> list[str]:
             old.unlink(missing_ok=True)
         return ["design.json"]
     write_bytes(table, commands(found).encode())
+    if not can_draw(report):
+        return ["design.json", table.name]
+    from slipid.plots.design import design_figure
+    from slipid.plots.drawing import save
+
     save(design_figure(found), picture)
     return ["design.json", table.name, picture.name]

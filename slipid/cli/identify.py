@@ -5,7 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, flag, guarded, option
+from slipid.cli.common import (
+    ConfigFile,
+    DataFolder,
+    Json,
+    Out,
+    Quiet,
+    can_draw,
+    emit,
+    flag,
+    guarded,
+    option,
+)
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -111,14 +122,23 @@ def run(
     """
     from slipid.app.identify import identify
     from slipid.deploy.deploy import write_robot
-    from slipid.plots.drawing import save
-    from slipid.plots.fit import identify_plots
-    from slipid.plots.posterior import profile_figure
     from slipid.report.html.fit_page import write_fit_report
 
     done = identify(task, data, out, report, profiles)
-    report.stage("drawing")
-    drawn = [out / name for name in write_robot(out, done.fit)]
+    written = (*done.written, *write_robot(out, done.fit))
+    if can_draw(report):
+        written += tuple(path.name for path in _draw(done, out, report))
+    page = write_fit_report(done.fit, done.task.dataset, out, report)
+    return replace(done, written=(*page, *written))
+
+
+def _draw(done: "IdentifyResult", out: Path, report: Reporter) -> list[Path]:
+    """Write the pictures of a fit and of its profiles; return the files."""
+    from slipid.plots.drawing import save
+    from slipid.plots.fit import identify_plots
+    from slipid.plots.posterior import profile_figure
+
+    drawn: list[Path] = []
     try:
         warning = done.fit.trust.warning
         drawn += identify_plots(done.fit, done.task.dataset, out, warning)
@@ -126,8 +146,7 @@ def run(
         report.line(f"no further pictures: {error}")
     if done.profiles:
         drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
-    page = write_fit_report(done.fit, done.task.dataset, out, report)
-    return replace(done, written=(*page, *done.written, *(path.name for path in drawn)))
+    return drawn
 
 
 def bench(
@@ -135,7 +154,6 @@ def bench(
 ) -> int:
     """Identify motors on a bench, write and print the result, and return the exit code."""
     from slipid.app.bench import identify_bench
-    from slipid.plots.bench import bench_plots
     from slipid.report.estimates import show_bench
     from slipid.report.html.bench_page import bench_page
     from slipid.report.html.page import try_page
@@ -144,8 +162,10 @@ def bench(
         raise DataError("--profile is not available for drive = 'motor'; omit it")
     with Reporter(quiet=quiet) as report:
         fit, written = identify_bench(config, data, out, report)
-        report.stage("drawing")
-        written = (*written, *(path.name for path in bench_plots(fit, out)))
+        if can_draw(report):
+            from slipid.plots.bench import bench_plots
+
+            written = (*written, *(path.name for path in bench_plots(fit, out)))
         page = bench_page(fit, config.path.name)
         written = (*try_page(page, out, report), *written)
     emit(json, fit.to_json(), lambda page: show_bench(page, fit), out, written)

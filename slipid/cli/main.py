@@ -4,11 +4,17 @@ Commands import their libraries when they run, so that `slipid --help` does not 
 """
 
 import _thread
+import re
 import sys
 import threading
+from collections.abc import Callable
+from inspect import cleandoc
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
+from slipid import __version__
 from slipid.cli.benchmark import benchmark, paper
 from slipid.cli.calibrate import calibrate
 from slipid.cli.check import check
@@ -28,20 +34,212 @@ from slipid.cli.track import track
 from slipid.cli.trial import trial
 from slipid.cli.validate import compare, validate
 
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+
+class Command(NamedTuple):
+    """A command of the command line.
+
+    Attributes:
+        run: its function; the docstring is the help.
+        line: what it does, in the list of commands.
+        example: a command to type, with which the help begins.
+    """
+
+    run: Callable[..., None]
+    line: str
+    example: str
+
+
+PANELS: dict[str, tuple[Command, ...]] = {
+    "Start": (
+        Command(demo, "Identify a robot from logs that ship with slipid", "slipid demo"),
+        Command(new, "Write a config for your robot, from its logs", "slipid new --from logs"),
+        Command(
+            reference, "List every key, channel, unit and parameter", "slipid reference channels"
+        ),
+    ),
+    "From logs": (
+        Command(
+            check,
+            "Find mistakes in logs, and what a fit can learn from them",
+            "slipid check robot.toml --data logs",
+        ),
+        Command(
+            identify,
+            "Calibrate a robot and fit its motors, floors and loads",
+            "slipid identify robot.toml --data logs --out out/robot",
+        ),
+        Command(
+            validate,
+            "Predict runs that the fit has not seen",
+            "slipid validate out/robot --data other --json validation.json",
+        ),
+        Command(
+            report,
+            "Write the page of a fit again, with all results since",
+            "slipid report out/robot",
+        ),
+        Command(
+            compare,
+            "Find the slip model that predicts best on every floor",
+            "slipid compare robot.toml --data logs --out out/compare",
+        ),
+        Command(
+            motor, "Identify a motor on a bench", "slipid motor bench.csv --current I:mA --out out"
+        ),
+    ),
+    "Uncertainty": (
+        Command(sample, "Sample the posterior of a fit", "slipid sample out/robot"),
+        Command(
+            design, "Propose which runs to drive next", "slipid design out/robot --predict gray:0.3"
+        ),
+        Command(
+            selftest,
+            "Simulate an experiment, and what it can recover",
+            "slipid selftest robot.toml --out out/selftest",
+        ),
+    ),
+    "On the robot": (
+        Command(
+            export,
+            "Write C99, ROS 2, StableHLO and tables for the robot",
+            "slipid export out/robot --out out/to_go",
+        ),
+        Command(
+            trial,
+            "Drive a simulated robot with every controller",
+            "slipid trial out/robot --plant twin",
+        ),
+    ),
+    "Camera": (
+        Command(
+            calibrate,
+            "Calibrate an overhead camera",
+            "slipid calibrate boards --board 7x5 --square 0.04 --marker 0.03",
+        ),
+        Command(
+            track,
+            "Find the poses of a robot in a video",
+            "slipid track run.mp4 --camera camera.json --out run.poses.csv",
+        ),
+        Command(
+            map_,
+            "Map the surfaces of a floor from a picture",
+            "slipid map floor.png --camera camera.json --out floor",
+        ),
+        Command(
+            floors,
+            "Find the floor under each wheel in logged runs",
+            "slipid floors out/robot --map map.geojson --data logs --out under",
+        ),
+    ),
+    "Laboratory": (
+        Command(
+            simulate,
+            "Simulate logs on the virtual test site",
+            "slipid simulate configs/testsite.toml --out out/site",
+        ),
+        Command(
+            benchmark,
+            "Compare slipid with published slip estimators",
+            "slipid benchmark --data data --quick",
+        ),
+        Command(paper, "Reproduce the 2021 paper", "slipid paper --data data --out out/paper"),
+    ),
+}
+"""Commands in the panels of the help."""
+
+
+class CommandHelp(TyperCommand):
+    """A command whose help lists its options in panels, as text that is not boxed."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for one in self.get_params(ctx):
+            default = "Arguments" if one.param_type_name == "argument" else "Options"
+            record = one.get_help_record(ctx)
+            if record is not None:
+                panels.setdefault(getattr(one, "rich_help_panel", None) or default, []).append(
+                    record
+                )
+        for panel, records in panels.items():
+            with _section(formatter, panel):
+                formatter.write_dl(records)
+
+
+class CommandList(TyperGroup):
+    """The group of all commands, whose help lists them in panels, a line each."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        width = max(len(_name(one)) for commands in PANELS.values() for one in commands)
+        for panel, commands in PANELS.items():
+            with _section(formatter, panel):
+                formatter.write_dl([(_name(one).ljust(width), one.line) for one in commands])
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        self.format_commands(ctx, formatter)
+        records = [one.get_help_record(ctx) for one in self.get_params(ctx)]
+        with _section(formatter, "Options"):
+            formatter.write_dl([one for one in records if one is not None])
+
+
+def _section(formatter: Any, title: str) -> "AbstractContextManager[None]":
+    """Return a section of a help, its title in bold letters on a terminal."""
+    made: AbstractContextManager[None] = formatter.section(typer.style(title, bold=True))
+    return made
+
+
+def _name(command: Command) -> str:
+    # `map_` only keeps the name of Python's built-in map free
+    return command.run.__name__.rstrip("_")
+
+
+def _help(command: Command) -> str:
+    """Return the help of a command: its example, then its docstring with a line a paragraph."""
+    text = cleandoc(command.run.__doc__ or "")
+    paragraphs = [re.sub(r"\s*\n\s*", " ", part) for part in text.split("\n\n")]
+    return "\n\n".join([f"Example: {command.example}", *paragraphs])
+
+
 app = typer.Typer(
     name="slipid",
-    help="Identify the motors, floor friction and wheel loads of a robot from its logs.",
+    cls=CommandList,
+    # Plain text needs half the lines of rich's boxes, and half the time.
+    rich_markup_mode=None,
     no_args_is_help=True,
-    add_completion=False,
+    epilog="slipid COMMAND --help: an example, and every option of a command",
     pretty_exceptions_enable=False,
 )
-for command in (
-    *(new, reference, motor, check, selftest, identify, report, sample, validate, compare),
-    *(design, trial, export, simulate, calibrate, track, map_, floors, paper),
-    *(benchmark, demo),
-):
-    # strip the underscore of `map_`, which only keeps the name of Python's built-in map free
-    app.command(command.__name__.rstrip("_"))(command)
+for panel, commands in PANELS.items():
+    for command in commands:
+        app.command(
+            _name(command),
+            cls=CommandHelp,
+            help=_help(command),
+            short_help=command.line,
+            rich_help_panel=panel,
+        )(command.run)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"slipid {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def slipid(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """Identify the motors, floor friction and wheel loads of a robot from its logs."""
+
 
 AGAIN_S = 0.05
 """Delay before an interrupt that Python ignored is sent again [s]."""

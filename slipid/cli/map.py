@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Out, Quiet, emit, guarded, option
+from slipid.cli.common import Json, Out, Quiet, can_draw, emit, guarded, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -46,7 +46,7 @@ def map_(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Make a map of the surfaces of a floor from one picture from above; needs slipid\[camera].
+    """Make a map of the surfaces of a floor from a picture from above; needs the extra `camera`.
 
     Without a config, the command proposes surfaces and writes them to palette.toml; rename the
     surfaces there and run the command again with --config. The command writes map.geojson, which
@@ -56,7 +56,6 @@ def map_(
     from slipid.camera.floor.grid import RobotShape
     from slipid.camera.floor.picture import MapOptions, map_of
     from slipid.camera.overhead import OverheadCamera
-    from slipid.plots.floor import floor_plot
     from slipid.support.files import write_bytes
     from slipid.support.jax_setup import one_blas_thread
 
@@ -71,8 +70,12 @@ def map_(
                 f"expected --config {out / PROPOSAL} with surfaces in it, or another folder"
             )
         result.vector.save(out / "map.geojson")
-        floor_plot(result.vector, result.floor.colour, result.floor.in_view, out / "map.png")
-        written = ["map.geojson", "map.png"]
+        written = ["map.geojson"]
+        if can_draw(report):
+            from slipid.plots.floor import floor_plot
+
+            floor_plot(result.vector, result.floor.colour, result.floor.in_view, out / "map.png")
+            written.append("map.png")
         if result.proposal is not None:
             write_bytes(out / PROPOSAL, result.proposal.encode())
             written.append(PROPOSAL)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, MaybeOut, Quiet, emit, flag, guarded, option
+from slipid.cli.common import Json, MaybeOut, Quiet, can_draw, emit, flag, guarded, option
 from slipid.support.progress import Reporter
 
 Column = str | None
@@ -74,13 +74,14 @@ def motor(
         fit = task.fit(report)
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:
-            from slipid.plots.bench import bench_plots
             from slipid.report.html.bench_page import bench_page
             from slipid.report.html.page import try_page
 
-            report.stage("drawing")
             write_json(out / "motor.json", content)
-            written += [path.name for path in bench_plots(fit, out)]
+            if can_draw(report):
+                from slipid.plots.bench import bench_plots
+
+                written += [path.name for path in bench_plots(fit, out)]
             written[:0] = try_page(bench_page(fit, file.name, task.columns_used), out, report)
     emit(json, content, lambda page: show_bench(page, fit, task.columns_used), out, written)
     return 0 if fit.good else 1

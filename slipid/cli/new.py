@@ -17,7 +17,7 @@ Text = str | None
 
 
 def _text(words: str, panel: str | None = None) -> object:
-    return typer.Option(help=words, rich_help_panel=panel, show_default=False)
+    return typer.Option(help=words, metavar="VALUE", rich_help_panel=panel, show_default=False)
 
 
 @guarded

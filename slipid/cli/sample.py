@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
-from slipid.support.errors import DataError
+from slipid.cli.common import Json, OutFolder, Quiet, can_draw, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 
@@ -36,24 +35,23 @@ def sample(
     quiet: Quiet = False,
 ) -> int:
     """Sample the posterior of a fit with emcee, for more exact intervals."""
+    from slipid.infer.posterior.blocks import Plan, require_packages
     from slipid.report.estimates import show_sample
     from slipid.support.files import read_json
 
-    try:
-        from slipid.app.sample import WRITTEN
-        from slipid.app.sample import sample as run
-        from slipid.deploy.deploy import write_robot
-        from slipid.infer.posterior.blocks import Plan
-        from slipid.plots.posterior import posterior_plots
-    except ImportError as error:
-        raise DataError(f"{error}; install it by `pip install slipid[posterior]`") from error
+    require_packages()
+    from slipid.app.sample import WRITTEN
+    from slipid.app.sample import sample as run
+    from slipid.deploy.deploy import write_robot
+
     with Reporter(quiet=quiet) as report:
         posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
-        robot = write_robot(out, posterior)
-        report.stage("drawing")
-        drawn = posterior_plots(posterior, out)
+        written = [*WRITTEN, *write_robot(out, posterior)]
+        if can_draw(report):
+            from slipid.plots.posterior import posterior_plots
+
+            written += [path.name for path in posterior_plots(posterior, out)]
     content = read_json(out / "identified.json", "a result of `slipid sample`")
     shown = posterior.parameters.values(), about, content["messages"]
-    written = (*WRITTEN, *robot, *(path.name for path in drawn))
     emit(json, content, lambda page: show_sample(page, *shown), out, written)
     return 0 if posterior.converged else 1

@@ -21,9 +21,9 @@ def selftest(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Simulate an experiment with known true values, and compare its fit with these values.
+    """Simulate an experiment with known true values, and compare its fit with these values.
 
-    Without --data, the runs are those planned in \[selftest] of the config. Writes selftest.json.
+    Without --data, the runs are those planned in [selftest] of the config. Writes selftest.json.
     After an interrupt, finished simulations are kept. The exit code is 1 if a parameter that should
     be recovered is not.
     """

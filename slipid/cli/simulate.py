@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def simulate(
     config: ConfigFile, out: Out, jobs: Jobs = None, json: Json = None, quiet: Quiet = False
 ) -> int:
-    r"""Simulate logs on the virtual test site (MuJoCo physics); needs slipid\[testsite].
+    """Simulate logs on the virtual test site (MuJoCo physics); needs the extra `testsite`.
 
     Writes the logs, a config for `slipid identify`, floor maps, and, in a separate folder, the true
     values. Finished runs are kept and not simulated again.

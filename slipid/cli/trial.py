@@ -11,6 +11,7 @@ from slipid.cli.common import (
     Load,
     OutFolder,
     Quiet,
+    can_draw,
     emit,
     executor_of,
     for_robots,
@@ -66,7 +67,6 @@ def trial(
     Gains are designed if robot.json has delay and lag of the wheels, else set by hand.
     Writes trial.json and trial.png to OUT. Finished runs are kept and not simulated again.
     """
-    from slipid.lab.trial.plots import trial_plot
     from slipid.lab.trial.trial import TrialOptions, controller_names
     from slipid.lab.trial.trial import trial as run
     from slipid.report.answers import show_trial
@@ -85,7 +85,9 @@ def trial(
     )
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
         done = run(out, options, executor, report)
-        report.stage("drawing")
-        trial_plot(done, out / "trial.png")
+        if can_draw(report):
+            from slipid.lab.trial.plots import trial_plot
+
+            trial_plot(done, out / "trial.png")
     emit(json, done.content, lambda page: show_trial(page, done.content, out))
     return 0

@@ -10,6 +10,7 @@ from slipid.cli.common import (
     Out,
     OutFolder,
     Quiet,
+    can_draw,
     emit,
     for_robots,
     option,
@@ -55,7 +56,6 @@ def run(out: Path, data: Path, report: Reporter, logs: str | None = None) -> Con
     """
     from slipid.app.compare import validate, validate_calibration
     from slipid.infer.fit_file import FIT, IDENTIFIED
-    from slipid.plots.fit import validate_plots
     from slipid.support.files import write_json
 
     if (out / IDENTIFIED).exists() and not (out / FIT).exists():
@@ -65,9 +65,11 @@ def run(out: Path, data: Path, report: Reporter, logs: str | None = None) -> Con
     fit, dataset, found = validate(out, data, report, logs)
     content = found.to_json()
     write_json(out / VALIDATION, content)
-    report.stage("drawing")
-    drawn = validate_plots(fit, dataset, found, out)
-    report.line(f"in {out}: {VALIDATION}, {', '.join(path.name for path in drawn)}")
+    if can_draw(report):
+        from slipid.plots.fit import validate_plots
+
+        drawn = validate_plots(fit, dataset, found, out)
+        report.line(f"in {out}: {VALIDATION}, {', '.join(path.name for path in drawn)}")
     return content
 
 
@@ -88,11 +90,15 @@ def compare(
     Writes comparison.json and a picture. Finished folds are kept in OUT and are not fitted again.
     """
     from slipid.app.compare import compare as run
-    from slipid.plots.compare import compare_plot
     from slipid.report.answers import show_comparison
 
     with Reporter(quiet=quiet) as report:
         found = run(config, data, out, folds.replace(" ", "").split(","), report)
-        report.line(f"written to {out}: comparison.json, {compare_plot(found, out).name}")
+        written = ["comparison.json"]
+        if can_draw(report):
+            from slipid.plots.compare import compare_plot
+
+            written.append(compare_plot(found, out).name)
+        report.line(f"written to {out}: {', '.join(written)}")
     emit(json, found, lambda page: show_comparison(page, found))
     return 0 if all(q["converged"] for q in found["questions"].values()) else 1

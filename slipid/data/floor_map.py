@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from pydantic import Field, FiniteFloat
 
 from slipid.support.errors import DataError
+from slipid.support.extras import require
 from slipid.support.files import write_bytes
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
@@ -82,6 +83,7 @@ def from_polygons(
     Raises:
         ValueError: more than `MOST_CELLS` cells.
     """
+    _require_matplotlib()
     from matplotlib.path import Path as Outline
 
     surfaces = tuple(dict.fromkeys([base, *(name for name, _ in patches)]))
@@ -149,6 +151,10 @@ def four_zones(surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.
     zone = np.ones((round(reach / cell), round(reach / cell)), np.intp)
     cells = np.kron([[d, c], [a, b]], zone)
     return FloorMap(names, cells, (middle[0] - reach, middle[1] - reach), cell)
+
+
+def _require_matplotlib() -> None:
+    require("matplotlib", "report", "a floor map")
 
 
 def _few(cells: int) -> None:
@@ -225,6 +231,7 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
 
     `colours` has a different colour `#rrggbb` for each surface.
     """
+    _require_matplotlib()
     from matplotlib.colors import to_rgb
     from matplotlib.image import imsave
 
@@ -251,6 +258,7 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
 
 def _pictured(path: Path, given: PicturedFile) -> FloorMap:
     """Return the map in a picture: each pixel is a cell with the surface of the nearest colour."""
+    _require_matplotlib()
     from matplotlib.colors import to_rgb
     from matplotlib.image import imread
 

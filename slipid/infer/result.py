@@ -254,7 +254,7 @@ class Fit:
         plan: "Plan | None" = None,
         quiet: bool = False,
     ) -> "Posterior":
-        """Sample the posterior with several emcee ensembles; needs `slipid[posterior]`.
+        """Sample the posterior with several emcee ensembles; needs the extra `posterior`.
 
         Args:
             seed: seed of all random numbers.
@@ -262,8 +262,14 @@ class Fit:
             most: number of blocks after which sampling ends even without convergence.
             plan: settings of the sampler, which replace `seed` and `most`.
             quiet: show no progress.
+
+        Raises:
+            MissingExtra: a package is not installed; the message names the command to type.
         """
-        from slipid.infer.posterior import blocks, sample
+        from slipid.infer.posterior import blocks
+
+        blocks.require_packages()
+        from slipid.infer.posterior import sample
 
         plan = plan or blocks.Plan(seed=seed, most=most)
         with Reporter(quiet=quiet) as report:

@@ -79,7 +79,7 @@ def test_the_recording_needs_neither_mujoco_nor_opencv(tmp_path):
         "class Absent:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name.split('.')[0] in ('mujoco', 'cv2'):\n"
-        "            raise ImportError(name)\n"
+        "            raise ModuleNotFoundError(name, name=name)\n"
         "sys.meta_path.insert(0, Absent())\n"
         "from pathlib import Path\n"
         "from slipid.app.logs import packaged_config, unpack\n"
@@ -95,7 +95,7 @@ def test_the_recording_needs_neither_mujoco_nor_opencv(tmp_path):
         "    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "the virtual test site needs MuJoCo; expected: pip install" in done.stdout
+    assert "the virtual test site needs the package mujoco, which is not installed" in done.stdout
     assert (tmp_path / "fit" / "truth" / "truth.json").is_file()
 
 

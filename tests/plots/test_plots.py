@@ -15,6 +15,7 @@ from slipid.data.windows import windows
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.design.planned_runs import PlannedRun
+from slipid.infer.measured_windows import by_heading, measured_windows
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import (
@@ -28,7 +29,6 @@ from slipid.model.geometry import differential, omni
 from slipid.plots import fit as plots
 from slipid.plots.compare import MODEL_NAMES, validation_figure
 from slipid.plots.drawing import figure, save
-from slipid.infer.measured_windows import by_heading, measured_windows
 from slipid.plots.motion import heading_figure
 from slipid.plots.wheels import current_figure, wheel_curve
 from slipid.predict.slip_models import slip_models

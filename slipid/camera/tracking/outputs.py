@@ -8,6 +8,7 @@ size of the markers divided by the true size [1]; rejected_x, rejected_y [m], re
 """
 
 import io
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -18,6 +19,7 @@ from slipid.camera.opencv import Grey, cv2
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.track import Flag, TrackedPoses
 from slipid.support.errors import DataError
+from slipid.support.extras import require
 from slipid.support.files import writable, write_bytes
 
 _FORMATS = {
@@ -93,14 +95,8 @@ def _csv(track: TrackedPoses) -> str:
 
 
 def _pyarrow() -> ModuleType:
-    try:
-        import pyarrow.parquet
-    except ImportError as error:
-        raise DataError(
-            f"Parquet needs {error.name}, which is not installed; expected: pip install "
-            "'slipid[parquet]', or a name that ends in .csv"
-        ) from error
-    return pyarrow
+    require("pyarrow.parquet", "parquet", "a file of poses that does not end in .csv")
+    return import_module("pyarrow")
 
 
 def _parquet(track: TrackedPoses) -> bytes:

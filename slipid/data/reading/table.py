@@ -17,6 +17,7 @@ from slipid.data.reading.containers import refuse_other
 from slipid.data.reading.layout import Channel, Layout
 from slipid.data.reading.units import same_unit
 from slipid.support.errors import bad_data, first_names
+from slipid.support.extras import missing
 
 if TYPE_CHECKING:
     from pyarrow import Table as ParquetTable
@@ -129,8 +130,7 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
         import pyarrow
         import pyarrow.parquet as parquet
     except ImportError as error:
-        expected = "the package pyarrow, which reads such files; run: pip install 'slipid[parquet]'"
-        raise bad_data(path, "a Parquet file", expected) from error
+        raise missing("parquet", f"{path}: a Parquet file", error) from error
     try:
         table = parquet.read_table(pyarrow.BufferReader(raw))
     except pyarrow.ArrowException as error:

@@ -7,10 +7,20 @@ import numpy as np
 from jaxtyping import Float, Int, UInt32
 
 from slipid.infer.posterior.transport_map import Matrix, Transport, Warp, gaussian
+from slipid.support.extras import require
 
 FORMAT = 6
 """Version of the block files; it must be increased if their content or the algorithm changes."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
+
+
+def require_packages() -> None:
+    """Raise `MissingExtra` unless the packages are installed that sampling needs, some at its end.
+
+    Call it before the modules of this package are imported that need them.
+    """
+    for module in ("emcee", "arviz_base", "arviz_stats", "h5netcdf"):
+        require(module, "posterior", "the posterior")
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.fit_file import curves_json, identified_json, number_json
-from slipid.infer.posterior.blocks import Chain, Plan
+from slipid.infer.posterior.blocks import Chain, Plan, require_packages
 from slipid.infer.result import Fit, required
 from slipid.infer.verdicts import estimates as verdicts
 from slipid.infer.verdicts.disputed import marked
@@ -119,6 +119,7 @@ class Posterior:
     @cached_property
     def tree(self) -> "DataTree":
         """ArviZ DataTree of draws, likelihoods and replicated data."""
+        require_packages()
         from slipid.infer.posterior import sample as netcdf
 
         return netcdf.tree(self)
@@ -150,6 +151,7 @@ class Posterior:
 
     def save(self, path: Path | str) -> None:
         """Write posterior.nc completely or not at all."""
+        require_packages()
         from slipid.infer.posterior import sample as netcdf
 
         netcdf.write(self.tree, Path(path))

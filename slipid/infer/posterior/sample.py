@@ -7,7 +7,6 @@ the electric parameters, which are drawn by Metropolis-Hastings steps with propo
 most likely values.
 """
 
-import importlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -34,10 +33,6 @@ from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
-
-# These packages are needed at the end: a missing one is reported here, not after hours of sampling.
-for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
-    importlib.import_module(_module)
 
 MOST_UNMOVED = 0.01
 """Largest tolerated fraction of draws whose electric parameters have no accepted proposal."""

@@ -12,6 +12,7 @@ from slipid.lab.testsite.robot_build import mjcf
 from slipid.lab.testsite.site import Site
 from slipid.lab.testsite.surfaces import Pose, Terrain, ribs
 from slipid.support.errors import DataError
+from slipid.support.extras import require
 
 TIMESTEP = 1e-3
 """Time step of the engine and of the speed loop [s]."""
@@ -24,14 +25,8 @@ RESISTANCE_SPEED = 0.02
 
 
 def engine() -> ModuleType:
-    """Return the mujoco module; raise `DataError` if it is not installed."""
-    try:
-        import mujoco
-    except ImportError:
-        raise DataError(
-            "the virtual test site needs MuJoCo; expected: pip install 'slipid[testsite]'"
-        ) from None
-    return mujoco
+    """Return the mujoco module; raise `MissingExtra` if it is not installed."""
+    return require("mujoco", "testsite", "the virtual test site")
 
 
 def heading_of(quaternion: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:

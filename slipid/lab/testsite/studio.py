@@ -17,6 +17,7 @@ from slipid.data.wheel_signals import interpolate
 from slipid.lab.testsite.robot_build import mjcf
 from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.support.errors import DataError
+from slipid.support.extras import missing
 
 Pose = Float[np.ndarray, "3"]
 Angles = Float[np.ndarray, " wheel"]
@@ -203,9 +204,7 @@ def _drawing_modules() -> tuple[ModuleType, ModuleType]:
     except ImportError as error:
         if "EGL" in str(error) or "OpenGL" in str(error):
             raise _drawing_error(error) from error
-        raise DataError(
-            f"the test site's camera needs {error.name}; expected: pip install 'slipid[testsite]'"
-        ) from error
+        raise missing("testsite", "the test site's camera", error) from error
     except AttributeError as error:  # raised by PyOpenGL if libEGL is absent
         raise _drawing_error(error) from error
     return mujoco, cv2

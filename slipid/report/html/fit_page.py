@@ -4,8 +4,8 @@ from pathlib import Path
 
 from slipid.app.calibrate import CalibrationResult
 from slipid.app.config import read_config
+from slipid.app.logs import log_folder
 from slipid.app.problem import read_fit_task
-from slipid.app.sample import log_folder
 from slipid.data.runs import Runs
 from slipid.infer.fit_file import FIT, load
 from slipid.infer.result import Fit

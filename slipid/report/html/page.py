@@ -13,7 +13,7 @@ from pathlib import Path
 
 from slipid.report.html.blocks import Badge, Figure, Player, Section
 from slipid.support.content import Content
-from slipid.support.errors import DataError
+from slipid.support.extras import MissingExtra, require
 from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
@@ -42,7 +42,8 @@ def write_page(page: Page, path: Path) -> Path:
     """Write a page and return its path.
 
     Raises:
-        DataError: jinja2 or plotly is not installed, or the file cannot be written.
+        MissingExtra: jinja2 or plotly is not installed.
+        DataError: the file cannot be written.
     """
     write_bytes(path, rendered(page).encode())
     return path
@@ -52,17 +53,16 @@ def try_page(page: Page, out: Path, report: Reporter) -> tuple[str, ...]:
     """Write report.html to a folder and return its name, or nothing if a library is missing."""
     try:
         return (write_page(page, out / REPORT).name,)
-    except DataError as error:  # the results are already written
+    except MissingExtra as error:  # the results are already written
         report.line(str(error))
         return ()
 
 
 def rendered(page: Page) -> str:
     """Return the HTML of a page."""
-    try:
-        from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    except ImportError as error:
-        raise DataError(_absent(error)) from error
+    _require("jinja2")
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     environment = Environment(
         loader=FileSystemLoader(_HERE),
         autoescape=True,
@@ -83,15 +83,14 @@ def rendered(page: Page) -> str:
 
 def _plotly() -> str:
     """Return plotly's JavaScript library, which its Python package contains."""
-    try:
-        from plotly.offline import get_plotlyjs
-    except ImportError as error:
-        raise DataError(_absent(error)) from error
+    _require("plotly.offline")
+    from plotly.offline import get_plotlyjs
+
     return str(get_plotlyjs())
 
 
-def _absent(error: ImportError) -> str:
-    return f"no page: {error.name} is not installed; `pip install slipid[report]` brings it"
+def _require(module: str) -> None:
+    require(module, "report", f"the page {REPORT}")
 
 
 def _content(sections: Iterable[Section]) -> Content:

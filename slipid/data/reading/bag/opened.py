@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from slipid.data.reading.bag.definitions import MessageType, definition_of
 from slipid.data.reading.bag.shape import MessageShape, shape_of
 from slipid.data.reading.bag.storage import OPENABLE, BagFiles, RepairedMcap, files_of, repaired
-from slipid.data.reading.bag.ulog import UlogConnection, UlogReader, require_pyulog, ulog_reader
+from slipid.data.reading.bag.ulog import UlogConnection, UlogReader, ulog_reader
 from slipid.support.errors import DataError, bad_data
+from slipid.support.extras import require
 
 if TYPE_CHECKING:
     import rosbags.interfaces
@@ -212,12 +213,15 @@ def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str
 
 def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Reader":
     """Return an open reader of a file or folder; raise `DataError` if it is damaged."""
-    from rosbags import rosbag1, rosbag2
-
-    pyulog = require_pyulog(files.path) if files.storage == "ulog" else None
+    if files.storage == "ulog":
+        require("pyulog", "ulog", f"{files.path}: a ULog file")
+    else:
+        require("rosbags", "bags", f"{files.path}: a bag")
     try:
-        if pyulog is not None:
-            return ulog_reader(files.path, pyulog)
+        if files.storage == "ulog":
+            return ulog_reader(files.path)
+        from rosbags import rosbag1, rosbag2
+
         if files.storage == "rosbag1":
             return stack.enter_context(rosbag1.Reader(files.path))
         # `RepairedMcap` has the methods of a path that rosbags calls.

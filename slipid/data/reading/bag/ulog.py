@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from slipid.data.reading.bag.definitions import ArrayType, FieldType, MessageType
-from slipid.support.errors import bad_data
 
 _DTYPES = {
     **{f"int{8 * size}_t": f"i{size}" for size in (1, 2, 4, 8)},
@@ -63,18 +62,10 @@ class UlogReader:
                 yield one, 1000 * stamp, raw[k * size : (k + 1) * size]
 
 
-def require_pyulog(path: Path) -> Any:
-    """Return the package pyulog; raise `DataError` if it is missing."""
-    try:
-        import pyulog
-    except ImportError as error:
-        expected = "the package pyulog, which reads such files; run: pip install 'slipid[ulog]'"
-        raise bad_data(path, "a ULog file", expected) from error
-    return pyulog
-
-
-def ulog_reader(path: Path, pyulog: Any) -> UlogReader:
+def ulog_reader(path: Path) -> UlogReader:
     """Return the reader of a ULog file; pyulog raises many types of errors on damaged bytes."""
+    import pyulog
+
     with path.open("rb") as file:
         log = pyulog.ULog(file)
     return UlogReader([_connection(one, log.message_formats) for one in log.data_list])

@@ -111,7 +111,7 @@ def test_a_damaged_log_is_named(log):
 
 def test_without_the_package_the_message_names_it(log, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyulog", None)
-    with pytest.raises(DataError, match=r"a ULog file.*pip install 'slipid\[ulog\]'"):
+    with pytest.raises(DataError, match=r"a ULog file needs the package pyulog.*\[ulog\]'"):
         topics_of(log)
 
 
