@@ -35,15 +35,16 @@ def benchmark(
     require("sklearn", "benchmark", "`slipid benchmark`")
     require("matplotlib", "benchmark", "`slipid benchmark`")
     from slipid.lab.benchmark.benchmark import benchmark as run
-    from slipid.lab.benchmark.report import benchmark_pictures, show_benchmark, write_page
+    from slipid.lab.benchmark.report import PAGE, benchmark_page, show_benchmark
     from slipid.lab.benchmark.work import BenchmarkOptions
+    from slipid.report.html.page import try_page
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
         found = run(BenchmarkOptions(data, out, only, quick), executor, report)
-        report.stage("drawing")
-        written = write_page(found, benchmark_pictures(found), out)
-        report.line(f"written to {out}: benchmark.json, {written.name}")
+        report.stage("writing the page")
+        written = ("benchmark.json", *try_page(benchmark_page(found), out / PAGE, report))
+        report.line(f"written to {out}: {', '.join(written)}")
     emit(json, found, lambda page: show_benchmark(page, found))
     every = [
         row

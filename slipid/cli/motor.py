@@ -75,13 +75,15 @@ def motor(
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:
             from slipid.report.html.bench_page import bench_page
-            from slipid.report.html.page import try_page
+            from slipid.report.html.page import REPORT, try_page
 
             write_json(out / "motor.json", content)
             if can_draw(report):
                 from slipid.plots.bench import bench_plots
 
                 written += [path.name for path in bench_plots(fit, out)]
-            written[:0] = try_page(bench_page(fit, file.name, task.columns_used), out, report)
+            written[:0] = try_page(
+                bench_page(fit, file.name, task.columns_used), out / REPORT, report
+            )
     emit(json, content, lambda page: show_bench(page, fit, task.columns_used), out, written)
     return 0 if fit.good else 1

@@ -74,7 +74,7 @@ class Predictions:
         return self.selected.get(floor, usual)
 
 
-def evidence_of_fit(fit: Fit, data: Runs) -> ev.Evidence:
+def evidence_of_fit(fit: Fit, data: Runs) -> ev.FitEvidence:
     """Return the evidence of a fit.
 
     Args:
@@ -95,7 +95,7 @@ def evidence_of_fit(fit: Fit, data: Runs) -> ev.Evidence:
 
 def evidence_of_predictions(
     models: Predictions, data_hash: str, notes: Sequence[str] = ()
-) -> ev.Evidence:
+) -> ev.FitEvidence:
     """Return the evidence of predicted runs, without that of a force balance."""
     data, notes = models.data, list(notes)
     reason = next(filter(None, (incomplete_poses(data, k) for k in range(len(data)))), None)
@@ -104,7 +104,7 @@ def evidence_of_predictions(
         runs = _paths(models)
     else:
         notes.append(f"no paths: {reason}")
-    return ev.Evidence(
+    return ev.FitEvidence(
         data_hash=data_hash,
         wheels=_wheels(models.shape),
         runs=runs,
@@ -113,9 +113,9 @@ def evidence_of_predictions(
     )
 
 
-def _wheels(shape: Geometry) -> ev.Wheels:
+def _wheels(shape: Geometry) -> ev.WheelLayout:
     place = np.asarray(shape.place) * float(shape.base_radius)
-    return ev.Wheels(
+    return ev.WheelLayout(
         place_m=[(float(x), float(y)) for x, y in place],
         angle_deg=np.degrees(shape.drive_angle).tolist(),
         drive=list(shape.drive_of or range(shape.wheels)),
@@ -236,7 +236,7 @@ def _track(pose: Float[np.ndarray, "edge 3"]) -> ev.Track:
     return ev.Track(x_mm=x, y_mm=y, yaw_mrad=yaw)
 
 
-def _region(done: _Replay, n: int) -> ev.Region:
+def _region(done: _Replay, n: int) -> ev.PointRegions:
     """Return the 90 % regions of the n-th run of a replay."""
     factor = np.sqrt(2 * fdtri(2, DEGREES, 0.9))
     edges, axes, angles = [], [], []
@@ -246,7 +246,7 @@ def _region(done: _Replay, n: int) -> ev.Region:
         axes.append(1000 * factor * np.sqrt(np.maximum(square, 0.0)))
         angles.append(round(1000 * float(np.arctan2(*direction[::-1, 1]))))
     minor, major = np.round(axes, 1).T.tolist()
-    return ev.Region(edge=edges, major_mm=major, minor_mm=minor, angle_mrad=angles)
+    return ev.PointRegions(edge=edges, major_mm=major, minor_mm=minor, angle_mrad=angles)
 
 
 def _quarters(runs: Sequence[ev.RunEvidence], data: Runs) -> ev.Quarters:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slipid.infer.fit_file import FIT, IDENTIFIED
-from slipid.report.html.evidence import EVIDENCE, Evidence, read_evidence
+from slipid.report.html.evidence import EVIDENCE, FitEvidence, read_evidence
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json
@@ -38,7 +38,7 @@ class Results:
     identified: Content
     run: Content
     fit: Content | None
-    evidence: Evidence | None
+    evidence: FitEvidence | None
     validation: Content | None
     comparison: Content | None
     trial: Content | None
@@ -60,13 +60,13 @@ class Results:
 
     @property
     def calibration(self) -> Content | None:
-        """Section `calibration` of identified.json."""
+        """PageSection `calibration` of identified.json."""
         found: Content | None = self.identified.get("calibration")
         return found
 
     @property
     def trust(self) -> Content:
-        """Section `trust` of identified.json; empty for a fit without calibrated kinematics."""
+        """PageSection `trust` of identified.json; empty for a fit without calibrated kinematics."""
         found: Content = self.identified.get("trust", {})
         return found
 
