@@ -14,7 +14,7 @@ from slipid.report.html.blocks import (
     Badge,
     Block,
     Cell,
-    CodeBlock,
+    CopyLines,
     FigureBlock,
     PageSection,
     TableBlock,
@@ -80,7 +80,7 @@ def _numbers(fit: BenchFit, name: str) -> PageSection:
     about = TextBlock(
         ["Lines that begin with # are numbers that this log does not determine well."]
     )
-    code = CodeBlock("Numbers to type in", "\n".join(lines))
+    code = CopyLines("Numbers to type in", "\n".join(lines))
     return PageSection("numbers", "Type these numbers into your robot", [about, code])
 
 

@@ -115,7 +115,7 @@ class DrawingBlock:
 
 
 @dataclass(frozen=True)
-class CodeBlock:
+class CopyLines:
     """Lines to copy.
 
     Attributes:
@@ -144,7 +144,7 @@ class Player:
     block: str = field(default="player", init=False)
 
 
-Block = TextBlock | TableBlock | FigureBlock | DrawingBlock | CodeBlock | Player
+Block = TextBlock | TableBlock | FigureBlock | DrawingBlock | CopyLines | Player
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from slipid.report.html.blocks import (
     Badge,
     Block,
     Cell,
-    CodeBlock,
+    CopyLines,
     FigureBlock,
     PageSection,
     TableBlock,
@@ -229,5 +229,5 @@ def _settings(found: Content) -> PageSection | None:
     about = TextBlock(
         ["Limits and noise by these logs; `slipid identify` uses them without asking."]
     )
-    code = CodeBlock("For the config", "\n".join(lines).strip())
+    code = CopyLines("For the config", "\n".join(lines).strip())
     return PageSection("settings", "Limits and noise", [about, code])

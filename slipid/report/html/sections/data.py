@@ -11,6 +11,7 @@ from slipid.report.html.blocks import (
     PageSection,
     TableBlock,
     TextBlock,
+    Trace,
     enumerated,
     number,
 )
@@ -322,7 +323,7 @@ def _pairs(found: Results, draws: dict[str, np.ndarray]) -> FigureBlock:
     return FigureBlock("pairs", title, alt, data, layout, caption, height, minimum=620)
 
 
-def _pair_panels(draws: dict[str, np.ndarray]) -> tuple[list[draw.Trace], Content]:
+def _pair_panels(draws: dict[str, np.ndarray]) -> tuple[list[Trace], Content]:
     """Return series and layout of a triangle of scatter plots, a panel for each pair."""
     names, data = list(draws), []
     count = len(names) - 1

@@ -3,7 +3,7 @@
 from slipid.report.html import figures as draw
 from slipid.report.html.blocks import (
     Block,
-    CodeBlock,
+    CopyLines,
     FigureBlock,
     PageSection,
     TableBlock,
@@ -108,13 +108,13 @@ def provenance(found: Results) -> PageSection:
     blocks: list[Block] = [TableBlock("Where these results come from.", ("what", "value"), rows)]
     kind = "" if found.fit is not None else " --only calibration"
     blocks.append(
-        CodeBlock(
+        CopyLines(
             "To repeat it",
             f"slipid identify {out.name}/config.toml --data LOGS --out {out.name}{kind}",
         )
     )
     lines = [f"{sentence:42}# {why}" for sentence, why in _next(found)]
-    blocks.append(CodeBlock("What you can do next", "\n".join(lines)))
+    blocks.append(CopyLines("What you can do next", "\n".join(lines)))
     files = ["robot.json"] if found.has_robot else []
     files += [f"{name}/" for name in found.exports]
     if files:

@@ -74,7 +74,7 @@ def _selection(found: Results, errors: Content) -> list[Block]:
             row = (floor, label(model), f"{100 * error:.2f}", difference, chosen)
             rows.append(row)
     title = "; ".join(_compared(f, errors[f], found.selected[f]) for f in floors[:3])
-    layout = {
+    layout: Content = {
         "xaxis": draw.axis("error on held-out runs [% of the path]", rangemode="tozero"),
         "yaxis": {"automargin": True, "autorange": "reversed"},
         "showlegend": True,
@@ -145,7 +145,7 @@ def _validation(content: Content) -> list[Block]:
     ]
     title = f"Other runs: the {label(chosen)} ends off by {enumerated(parts)} of the path"
     every = [s["endpoint_error_over_path_mean"] for f in summary.values() for s in f.values()]
-    layout = {
+    layout: Content = {
         "xaxis": draw.axis("mean end-point error [% of the path]"),
         "yaxis": {"automargin": True, "autorange": "reversed"},
         "showlegend": True,

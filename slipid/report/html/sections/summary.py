@@ -7,7 +7,7 @@ from slipid.report.html.blocks import (
     Badge,
     Block,
     Cell,
-    CodeBlock,
+    CopyLines,
     FigureBlock,
     PageSection,
     TableBlock,
@@ -104,7 +104,7 @@ def numbers(found: Results) -> PageSection | None:
             "drive controllers of ROS take them."
         ]
     )
-    blocks: list[Block] = [about, CodeBlock("Numbers to type in", text)]
+    blocks: list[Block] = [about, CopyLines("Numbers to type in", text)]
     return PageSection("numbers", "Type these numbers into your robot", blocks)
 
 
