@@ -20,6 +20,7 @@ from slipid.cli.identify import identify
 from slipid.cli.map import map_
 from slipid.cli.motor import motor
 from slipid.cli.new import new, reference
+from slipid.cli.robots import robots
 from slipid.cli.sample import sample
 from slipid.cli.selftest import selftest
 from slipid.cli.simulate import simulate
@@ -35,7 +36,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    *(new, reference, motor, check, selftest, identify, sample, validate, compare),
+    *(new, reference, robots, motor, check, selftest, identify, sample, validate, compare),
     *(design, trial, export, simulate, calibrate, track, map_, floors, paper),
     *(benchmark, demo),
 ):
