@@ -14,7 +14,7 @@ from slipid.report.html.evidence import EVIDENCE, FitEvidence, write_evidence
 from slipid.report.html.gather import Predictions, evidence_of_fit, evidence_of_predictions
 from slipid.report.html.page import REPORT, WebPage, write_page
 from slipid.report.html.results import Results, read_results
-from slipid.report.html.sections import data, outlook, predictions, summary, wheels
+from slipid.report.html.sections import data, others, outlook, predictions, summary, wheels
 from slipid.support.errors import DataError
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
@@ -34,6 +34,7 @@ SECTIONS = (
     data.posterior,
     outlook.trial,
     outlook.design,
+    others.others,
     outlook.provenance,
 )
 """Functions that return the sections, or None where the results have nothing for them."""

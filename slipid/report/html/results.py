@@ -11,6 +11,7 @@ from slipid.report.html.evidence import EVIDENCE, FitEvidence, read_evidence
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json
+from slipid.support.toml_file import mapping_of, text_of
 
 RESULT = "a result of `slipid identify`"
 DRAWS = "posterior.nc"
@@ -24,6 +25,7 @@ class Results:
 
     Attributes:
         folder: the result folder.
+        drive: type of the robot's wheels, as in its config.
         identified: content of identified.json.
         run: content of run.json.
         fit: content of fit.json; None for a calibration alone.
@@ -35,6 +37,7 @@ class Results:
     """
 
     folder: Path
+    drive: str
     identified: Content
     run: Content
     fit: Content | None
@@ -102,6 +105,7 @@ def read_results(out: Path) -> Results:
         )
     return Results(
         folder=out,
+        drive=_drive(out / "config.toml"),
         identified=identified,
         run=run,
         fit=_maybe(out / FIT),
@@ -115,6 +119,12 @@ def read_results(out: Path) -> Results:
         exports=tuple(sorted(p.parent.name for p in out.glob("*/SHA256SUMS"))),
         has_robot=(out / "robot.json").exists(),
     )
+
+
+def _drive(config: Path) -> str:
+    """Return the type of wheels in a config; empty if it names none."""
+    robot = mapping_of(config, text_of(config)).get("robot")
+    return str(robot.get("drive", "")) if isinstance(robot, dict) else ""
 
 
 def _content(path: Path, what: str) -> Content:

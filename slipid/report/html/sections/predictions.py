@@ -79,7 +79,7 @@ def _selection(found: Results, errors: Content) -> list[Block]:
         "yaxis": {"automargin": True, "autorange": "reversed"},
         "showlegend": True,
     }
-    if _wide([100 * e for each in errors.values() for e in each.values()]):
+    if is_wide([100 * e for each in errors.values() for e in each.values()]):
         layout["xaxis"] |= {"type": "log", "rangemode": "normal"}
     alt = f"{title}. Dots show the error of every model on every floor; the table has the numbers."
     caption = (
@@ -95,7 +95,7 @@ def _selection(found: Results, errors: Content) -> list[Block]:
     ]
 
 
-def _wide(values: Sequence[float]) -> bool:
+def is_wide(values: Sequence[float]) -> bool:
     """Return whether values need a logarithmic axis."""
     return min(values) > 0 and max(values) > 15 * min(values)
 
@@ -150,7 +150,7 @@ def _validation(content: Content) -> list[Block]:
         "yaxis": {"automargin": True, "autorange": "reversed"},
         "showlegend": True,
     }
-    layout["xaxis"] |= {"type": "log"} if _wide(every) else {"rangemode": "tozero"}
+    layout["xaxis"] |= {"type": "log"} if is_wide(every) else {"rangemode": "tozero"}
     alt = f"{title}. Dots show the error of every model by floor; the table has the numbers."
     head = ("floor", "model", "end error [% of path]", "heading [deg]", "in 90 % region", "runs")
     about = "Errors of open-loop predictions of the runs of `slipid validate`, and coverage [%]."
