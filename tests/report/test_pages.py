@@ -142,7 +142,17 @@ def test_the_page_prints_with_every_figure(browser, fitted, tmp_path):
     assert page.evaluate("[...document.querySelectorAll('.plot')].every(d => d.dataset.drawn)")
 
 
-@pytest.mark.parametrize("kind", ["motor", "check", "one_run", *CALIBRATED])
+SELDOM = ("one_run", "heading_alone", "steered")
+"""Kinds of pages that only the nightly tests make."""
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("motor", "check", *(kind for kind in CALIBRATED if kind not in SELDOM)),
+        *(pytest.param(kind, marks=pytest.mark.nightly) for kind in SELDOM),
+    ],
+)
 def test_pages_of_other_results_have_what_concerns_them(browser, small, tmp_path, kind):
     path = page_of(small, tmp_path, kind)
     for width in WIDTHS:

@@ -56,7 +56,8 @@ class RunEvidence(_Record):
         name, floor, load: name of the run, its floor and its load set-up.
         heading_deg: commanded direction of travel [deg], None if unknown.
         speed: commanded speed [m/s], None if unknown.
-        seconds: duration [s].
+        seconds: duration from the first motion on [s].
+        rest_s: time in the whole run in which no wheel turns [s].
         path_m: measured path length [m].
         time_s: time of each pose [s].
         measured: measured poses.
@@ -71,6 +72,7 @@ class RunEvidence(_Record):
     heading_deg: float | None
     speed: float | None
     seconds: float
+    rest_s: float
     path_m: float
     time_s: list[float]
     measured: Track

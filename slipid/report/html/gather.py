@@ -35,6 +35,8 @@ QUARTERS = 4
 """Number of parts of a run whose errors are shown."""
 TURNS_ON_SPOT = 0.3
 """Displacement over path length of a quarter below which it has no direction of travel [1]."""
+RESTING_M_S = 0.005
+"""Speed of the fastest rim below which a robot rests [m/s]."""
 LEAST_SHARE = 0.3
 """Smallest speed of a drawn wheel, as a share of that of the fastest wheel: the slip of slower
 wheels is too uncertain."""
@@ -222,6 +224,7 @@ def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
         heading_deg=round(float(heading), 1) if np.isfinite(heading) else None,
         speed=round(float(speed), 3) if np.isfinite(speed) else None,
         seconds=round(float(time[-1]), 2),
+        rest_s=round(_rest(data, k, float(models.shape.wheel_radius)), 2),
         path_m=round(float(np.linalg.norm(np.diff(measured, axis=0), axis=1).sum()), 4),
         time_s=np.round(time[kept], 2).tolist(),
         measured=_track(done.measured[n, kept]),
@@ -229,6 +232,14 @@ def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
         region=_region(done, n) if done.regions else None,
         selected=selected,
     )
+
+
+def _rest(data: Runs, k: int, radius: float) -> float:
+    """Return the time in a run in which no wheel turns [s]."""
+    rows = data.rows(k)
+    dt = np.diff(data.time[rows])
+    speed = radius * np.abs(np.diff(data.wheel_angle[rows], axis=0)).max(axis=1)
+    return float(dt[speed < RESTING_M_S * dt].sum())
 
 
 def _track(pose: Float[np.ndarray, "edge 3"]) -> ev.Track:
@@ -271,7 +282,7 @@ def _quarters(runs: Sequence[ev.RunEvidence], data: Runs) -> ev.Quarters:
                 "seconds": round(seconds, 2),
                 "speed": round(float(path) / seconds, 3),
                 "turn_deg_s": round(float(np.degrees(moved[2])) / seconds, 2),
-                "heading_deg": round(float(np.degrees(np.arctan2(*ahead[::-1]))) % 360, 1)
+                "heading_deg": round(float(np.degrees(np.arctan2(*ahead[::-1]))), 1) % 360
                 if moves
                 else None,
                 "along_mm_s": round(1000 * float(off[:2] @ ahead), 2),

@@ -24,8 +24,6 @@ STRONG = 0.9
 """Absolute correlation from which a pair of parameters is named [1]."""
 MOST_PAIRS, MOST_NAMES = 6, 26
 """Largest numbers of named pairs, and of parameters in the figure of correlations."""
-RESTING_M_S, RESTING_DEG_S = 0.005, 1.0
-"""Speed and yaw rate below which the robot rests [m/s, deg/s]."""
 SECTOR_DEG = 30
 """Width of a sector of directions of travel [deg]."""
 
