@@ -1,0 +1,84 @@
+"""Settings of the documentation site: `make docs` builds it without a network."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+sys.path[:0] = [str(HERE), str(ROOT)]
+
+import generate
+
+from slipid import __version__
+
+project = "slipid"
+author = "the authors of slipid"
+copyright = "the authors of slipid, Apache-2.0"
+release = version = __version__
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "myst_nb",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
+exclude_patterns = ["_build", "results/*.json", "jupyter_execute"]
+root_doc = "index"
+nitpicky = True
+nitpick_ignore_regex = [
+    # types of numpy, jax and the standard library, which have their own sites
+    ("py:.*", r"(?!slipid\b).*"),
+    # bases and helpers that are not public
+    ("py:.*", r"slipid\..*\..*"),
+]
+
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_inline"]
+myst_heading_anchors = 4
+smartquotes = False
+# docstrings write names of code between single backticks
+default_role = "code"
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+
+# Notebooks of the tutorials run when the site is built; the lessons are run by the test suite.
+nb_execution_mode = os.environ.get("SLIPID_DOCS_EXECUTE", "cache")
+nb_execution_cache_path = str(ROOT / ".cache" / "docs-notebooks")
+nb_execution_excludepatterns = ["lessons/*"]
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
+nb_execution_show_tb = True
+nb_merge_streams = True
+
+html_theme = "furo"
+html_title = f"slipid {version}"
+html_static_path = ["_static"]
+html_css_files = ["slipid.css"]
+html_copy_source = False
+html_show_sourcelink = False
+linkcheck_ignore = [r"https?://.*"]
+copybutton_prompt_text = r"\$ "
+
+
+def setup(app) -> None:
+    """Connect the generated parts to the build."""
+    os.environ.setdefault("COLUMNS", "100")
+    lessons = HERE / "lessons"
+    lessons.mkdir(exist_ok=True)
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        target = lessons / path.name
+        if not target.exists() or target.read_bytes() != path.read_bytes():
+            shutil.copy(path, target)
+    generate.schemas(HERE / "_static" / "schemas")
+    app.connect("source-read", _expand)
+
+
+def _expand(app, name: str, source: list[str]) -> None:
+    source[0] = generate.expand(source[0])
