@@ -12,6 +12,7 @@ ROOT = HERE.parent
 sys.path[:0] = [str(HERE), str(ROOT)]
 
 import generate
+from docutils import nodes
 
 from slipid import __version__
 
@@ -55,6 +56,8 @@ nb_execution_excludepatterns = ["lessons/*"]
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600
 nb_execution_show_tb = True
+nb_execution_in_temp = True
+nb_output_stderr = "remove"
 nb_merge_streams = True
 
 html_theme = "furo"
@@ -69,7 +72,9 @@ copybutton_prompt_text = r"\$ "
 
 def setup(app) -> None:
     """Connect the generated parts to the build."""
-    os.environ.setdefault("COLUMNS", "100")
+    # what the notebooks run: this Python's commands, plain text of one width
+    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    os.environ |= {"COLUMNS": "100", "IPYTHONDIR": str(_plain_ipython())}
     lessons = HERE / "lessons"
     lessons.mkdir(exist_ok=True)
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
@@ -78,7 +83,31 @@ def setup(app) -> None:
             shutil.copy(path, target)
     generate.schemas(HERE / "_static" / "schemas")
     app.connect("source-read", _expand)
+    app.connect("doctree-read", _plain_commands)
+
+
+def _plain_ipython() -> Path:
+    """Return a settings folder in which notebooks do not ask commands for colours."""
+    folder = ROOT / ".cache" / "docs-ipython"
+    startup = folder / "profile_default" / "startup"
+    startup.mkdir(parents=True, exist_ok=True)
+    words = "for name in ('CLICOLOR', 'CLICOLOR_FORCE', 'FORCE_COLOR'):\n"
+    (startup / "plain.py").write_text(f"import os\n\n{words}    os.environ.pop(name, None)\n")
+    return folder
 
 
 def _expand(app, name: str, source: list[str]) -> None:
-    source[0] = generate.expand(source[0])
+    before = source[0]
+    source[0] = generate.expand(before)
+    if source[0] != before:
+        for path in generate.RESULTS.glob("*.json"):
+            app.env.note_dependency(str(path), docname=name)
+
+
+def _plain_commands(app, doctree) -> None:
+    """Show a cell of commands as commands, without the line that makes the notebook run them."""
+    for node in doctree.findall(nodes.literal_block):
+        if node.rawsource.startswith("%%sh\n"):
+            text = node.rawsource.removeprefix("%%sh\n")
+            node.rawsource, node["language"] = text, "sh"
+            node.children = [nodes.Text(text)]

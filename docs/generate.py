@@ -1,6 +1,6 @@
 """Text of the documentation that is made from the code: commands, functions, schemas, results.
 
-A page asks for a part by an empty fenced block, ```` ```{generated} NAME ```` and its end; `conf.py`
+A page asks for a part by an empty fenced block with the language `{generated} NAME`; `conf.py`
 replaces the block by Markdown when Sphinx reads the page. Nothing here is typed by hand.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
-BLOCK = re.compile(r"^```\{generated\} (?P<name>[a-z-]+)(?: (?P<argument>\S+))?\n```$", re.M)
+BLOCK = re.compile(r"^```\{generated\} (?P<name>[a-z_]+)(?: (?P<argument>\w+))?\n```$", re.M)
 
 
 def expand(text: str) -> str:
@@ -178,9 +178,42 @@ def _schemas() -> dict[str, tuple[Mapping[str, Any], str]]:
     }
 
 
+def result(name: str) -> str:
+    """Return the table of a results file, and how it was measured.
+
+    Args:
+        name: name of the file in `docs/results`, without `.json`.
+    """
+    content = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    rows = [
+        [f"**{cell}**" if k in content["bold_rows"] and cell else cell for cell in map(text, row)]
+        for k, row in enumerate(content["rows"])
+    ]
+    made = (
+        f"Measured on {content['date']} with slipid {content['slipid']} on {content['machine']}, by"
+    )
+    return "\n\n".join(
+        [
+            f"Values: {content['values']}.",
+            table(content["columns"], rows),
+            f"{made}\n\n```console\n{content['command']}\n```",
+        ]
+    )
+
+
+def text(cell: float | str | Sequence[float] | None) -> str:
+    """Return a cell of a results file as text; a list is a value with its interval."""
+    if cell is None:
+        return ""
+    if isinstance(cell, list):
+        return "{} [{}, {}]".format(*cell)
+    return str(cell)
+
+
 PARTS: dict[str, Callable[..., str]] = {
     "commands": commands,
     "functions": functions,
+    "result": result,
     "schemas": schemas,
 }
 """Function that writes each part, by the name that a page gives."""
