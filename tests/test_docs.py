@@ -23,6 +23,7 @@ import typer
 
 import slipid
 from slipid.cli.main import app
+from tests.helpers.kept import kept
 from tests.helpers.shared import invoke
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -258,8 +259,13 @@ RUN = [
 ]
 
 
+LONG = {"what_to_drive", "deploy"}
+"""Pages whose commands take more than ten seconds."""
+QUICK = [page for page in RUN if page.stem not in LONG]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("page", RUN, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", kept(RUN, QUICK), ids=lambda page: page.stem)
 def test_code_of_a_page_runs(page, demo_folder, monkeypatch):
     run_page(page, demo_folder, monkeypatch, "python", "sh")
 
