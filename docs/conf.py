@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import sys
+from ctypes.util import find_library
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -51,14 +53,19 @@ napoleon_use_ivar = True
 
 # Notebooks of the tutorials run when the site is built; the lessons are run by the test suite.
 nb_execution_mode = os.environ.get("SLIPID_DOCS_EXECUTE", "cache")
-nb_execution_cache_path = str(ROOT / ".cache" / "docs-notebooks")
+# What they printed is kept for these sources of slipid: other sources run them again.
+SOURCES = [*sorted((ROOT / "slipid").rglob("*.py")), HERE / "_ipython" / "commands.py"]
+STATE = hashlib.sha256(b"".join(path.read_bytes() for path in SOURCES)).hexdigest()[:12]
+nb_execution_cache_path = str(ROOT / ".cache" / "docs-notebooks" / STATE)
 nb_execution_excludepatterns = ["lessons/*"]
+if find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # films without a screen
+else:
+    nb_execution_excludepatterns.append("tutorials/omni_camera*")
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600
 nb_execution_show_tb = True
 nb_execution_in_temp = True
-nb_output_stderr = "remove"
-nb_merge_streams = True
 
 html_theme = "furo"
 html_title = f"slipid {version}"
@@ -87,12 +94,11 @@ def setup(app) -> None:
 
 
 def _plain_ipython() -> Path:
-    """Return a settings folder in which notebooks do not ask commands for colours."""
+    """Return a settings folder with what notebooks run first; IPython writes its history there."""
     folder = ROOT / ".cache" / "docs-ipython"
     startup = folder / "profile_default" / "startup"
     startup.mkdir(parents=True, exist_ok=True)
-    words = "for name in ('CLICOLOR', 'CLICOLOR_FORCE', 'FORCE_COLOR'):\n"
-    (startup / "plain.py").write_text(f"import os\n\n{words}    os.environ.pop(name, None)\n")
+    shutil.copy(HERE / "_ipython" / "commands.py", startup)
     return folder
 
 

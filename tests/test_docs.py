@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from ctypes.util import find_library
 from dataclasses import dataclass
 from functools import cache
 from html.parser import HTMLParser
@@ -144,7 +145,7 @@ def strings_of_the_package() -> str:
 
 def messages() -> list[str]:
     page = (DOCS / "howto" / "errors.md").read_text(encoding="utf-8")
-    return re.findall(r"^\| (`.*?`) \| ", page, re.M)
+    return re.findall(r"^\| (`+.*?`+) \| ", page, re.M)
 
 
 def test_there_are_messages():
@@ -153,7 +154,7 @@ def test_there_are_messages():
 
 @pytest.mark.parametrize("message", messages())
 def test_a_catalogued_message_is_one_of_the_program(message):
-    parts = [part for part in message[1:-1].split("...") if part.strip(" ;:,'")]
+    parts = [part for part in message.strip("`").split("...") if part.strip(" ;:,'")]
     assert parts
     for part in parts:
         assert part in strings_of_the_package()
@@ -355,7 +356,8 @@ def test_the_site_builds_with_its_notebooks(tmp_path):
     built(tmp_path, "force")
     site = tmp_path / "html"
     assert broken_links(site) == []
-    for name in ("differential", "mecanum", "omni_camera", "motor"):
+    filmed = ("omni_camera",) if find_library("EGL") else ()
+    for name in ("differential", "mecanum", "motor", *filmed):
         page = Links((site / "tutorials" / f"{name}.html").read_text("utf-8"))
         shown = [picture for picture in page.pictures if "_images" in picture["src"]]
         assert shown
