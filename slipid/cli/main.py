@@ -15,6 +15,7 @@ from slipid.cli.check import check
 from slipid.cli.demo import demo
 from slipid.cli.design import design
 from slipid.cli.export import export
+from slipid.cli.export_run import export_run
 from slipid.cli.floors import floors
 from slipid.cli.identify import identify
 from slipid.cli.map import map_
@@ -36,11 +37,11 @@ app = typer.Typer(
 )
 for command in (
     *(new, reference, motor, check, selftest, identify, sample, validate, compare),
-    *(design, trial, export, simulate, calibrate, track, map_, floors, paper),
-    *(benchmark, demo),
+    *(design, trial, export, export_run, simulate, calibrate, track, map_, floors),
+    *(paper, benchmark, demo),
 ):
     # strip the underscore of `map_`, which only keeps the name of Python's built-in map free
-    app.command(command.__name__.rstrip("_"))(command)
+    app.command(command.__name__.rstrip("_").replace("_", "-"))(command)
 
 AGAIN_S = 0.05
 """Delay before an interrupt that Python ignored is sent again [s]."""
