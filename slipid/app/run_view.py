@@ -175,7 +175,10 @@ def _file_of(name: str, root: Path) -> str:
 
 def _read(config: Config, name: str, root: Path, report: Reporter) -> tuple[Runs, LogsSection]:
     """Return a run, and the section of the config by which it was read."""
-    pattern = glob.escape(_file_of(name, root))
+    file = _file_of(name, root)
+    if not _is_log(root / file):
+        raise DataError(f"{root / file}: no such log; expected the folder of the logs (--data)")
+    pattern = glob.escape(file)
     sections = [*config.content.logs, *config.content.validate_.logs]
     found = matching_files(config, sections, root, pattern)
     if not found:
