@@ -11,7 +11,7 @@ from slipid.support.errors import DataError
 
 
 @dataclass(frozen=True)
-class Topic:
+class McapTopic:
     """A topic of a file.
 
     Attributes:
@@ -37,7 +37,7 @@ class McapFile:
     """
 
     data: bytes
-    topics: tuple[Topic, ...]
+    topics: tuple[McapTopic, ...]
 
 
 def require_mcap() -> None:
@@ -67,7 +67,7 @@ def mcap_of(view: RunView) -> McapFile:
     writer.start(library=f"slipid {versions()['slipid']}")
     schemas: dict[str, int] = {}
     channels: dict[str, int] = {}
-    topics: dict[str, Topic] = {}
+    topics: dict[str, McapTopic] = {}
     begin = min(0.0, float(view.log.time[0]))  # times of messages are not negative
     for one in sorted(messages(view), key=lambda one: one.time):
         name, kind = one.channel.topic, one.content.DESCRIPTOR.full_name
@@ -77,7 +77,7 @@ def mcap_of(view: RunView) -> McapFile:
             about = {"unit": one.channel.unit, "meaning": one.channel.meaning}
             new = name, MessageEncoding.Protobuf, schemas[kind], about
             channels[name] = writer.register_channel(*new)
-            topics[name] = Topic(name, kind, one.channel.unit, 0)
+            topics[name] = McapTopic(name, kind, one.channel.unit, 0)
         time = round(1e9 * (one.time - begin))
         if "timestamp" in one.content.DESCRIPTOR.fields_by_name:
             one.content.timestamp.FromNanoseconds(time)

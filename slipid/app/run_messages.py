@@ -49,7 +49,7 @@ _DOUBLE, _STRING = 1, 9
 
 
 @dataclass(frozen=True)
-class Channel:
+class McapChannel:
     """A topic, with the unit and the meaning of its messages."""
 
     topic: str
@@ -58,15 +58,15 @@ class Channel:
 
 
 @dataclass(frozen=True, eq=False)
-class Message:
+class McapMessage:
     """A protobuf message on a channel, at a time of the run [s]."""
 
     time: float
-    channel: Channel
+    channel: McapChannel
     content: Any
 
 
-def messages(view: RunView) -> Iterator[Message]:
+def messages(view: RunView) -> Iterator[McapMessage]:
     """Yield all messages of a run, topic by topic."""
     if view.floor is not None:
         begin = min(float(path.time[0]) for path in view.paths.values())
@@ -84,30 +84,32 @@ def _schema(name: str) -> Callable[..., Any]:
     return made
 
 
-def _of_path(name: str, path: BodyPath, wheels: Float[np.ndarray, "wheel 2"]) -> Iterator[Message]:
+def _of_path(
+    name: str, path: BodyPath, wheels: Float[np.ndarray, "wheel 2"]
+) -> Iterator[McapMessage]:
     """Yield poses and regions of one path; at its beginning, the whole path and a robot."""
     if name == "estimator":
         path = path.rows(_apart(path.time))
-    pose = Channel(f"/pose/{name}", "m", f"{name} pose of the robot's middle")
-    frame = Channel("/tf", "m", f"a frame in '{FRAME}' for every pose")
+    pose = McapChannel(f"/pose/{name}", "m", f"{name} pose of the robot's middle")
+    frame = McapChannel("/tf", "m", f"a frame in '{FRAME}' for every pose")
     for time, (x, y, heading) in zip(path.time.tolist(), path.pose.tolist(), strict=True):
         place, turn = {"x": x, "y": y}, {"z": np.sin(heading / 2), "w": np.cos(heading / 2)}
         where = {"position": place, "orientation": turn}
-        yield Message(time, pose, _schema("PoseInFrame")(frame_id=FRAME, pose=where))
+        yield McapMessage(time, pose, _schema("PoseInFrame")(frame_id=FRAME, pose=where))
         ends = {"parent_frame_id": FRAME, "child_frame_id": name}
         moved = _schema("FrameTransform")(**ends, translation=place, rotation=turn)
-        yield Message(time, frame, moved)
+        yield McapMessage(time, frame, moved)
     begin, colour = float(path.time[0]), COLOURS[name]
-    whole = Channel(f"/path/{name}", "m", f"the whole path of {name}")
-    yield Message(begin, whole, _points(path.pose[:, :2], colour))
-    robot = Channel(f"/robot/{name}", "m", f"wheels, and a line ahead, in the frame '{name}'")
+    whole = McapChannel(f"/path/{name}", "m", f"the whole path of {name}")
+    yield McapMessage(begin, whole, _points(path.pose[:, :2], colour))
+    robot = McapChannel(f"/robot/{name}", "m", f"wheels, and a line ahead, in the frame '{name}'")
     ahead = np.zeros((HEADING_POINTS, 2))
     ahead[:, 0] = np.linspace(0.0, np.linalg.norm(wheels, axis=1).max(), HEADING_POINTS)
-    yield Message(begin, robot, _points(np.concatenate([wheels, ahead]), colour, name))
+    yield McapMessage(begin, robot, _points(np.concatenate([wheels, ahead]), colour, name))
     if (outlines := path.outlines(OUTLINE_POINTS)) is not None:
-        region = Channel(f"/region90/{name}", "m", f"outline of the 90 % region of {name}")
+        region = McapChannel(f"/region90/{name}", "m", f"outline of the 90 % region of {name}")
         for time, outline in zip(path.time.tolist(), outlines, strict=True):
-            yield Message(time, region, _points(outline, colour))
+            yield McapMessage(time, region, _points(outline, colour))
 
 
 def _points(
@@ -128,7 +130,7 @@ def _points(
     return cloud
 
 
-def _floor_map(floor: FloorMap, time: float) -> Message:
+def _floor_map(floor: FloorMap, time: float) -> McapMessage:
     """Return the middles of a map's cells, on a channel that names the colours of the floors."""
     every = int(np.ceil(np.sqrt(floor.cells.size / MOST_CELLS)))
     rows, columns = (np.arange(every // 2, n, every) for n in floor.cells.shape)
@@ -142,28 +144,30 @@ def _floor_map(floor: FloorMap, time: float) -> Message:
         f"{name} #{colour[:3].tobytes().hex()}"
         for name, colour in zip(floor.surfaces, of_floors, strict=True)
     )
-    channel = Channel("/floor_map", "m", f"middles of cells; colours of the floors: {named}")
-    return Message(time, channel, _points(middles, colours, height=-BELOW_M))
+    channel = McapChannel("/floor_map", "m", f"middles of cells; colours of the floors: {named}")
+    return McapMessage(time, channel, _points(middles, colours, height=-BELOW_M))
 
 
-def _of_estimate(view: RunView, found: EstimatedRun) -> Iterator[Message]:
+def _of_estimate(view: RunView, found: EstimatedRun) -> Iterator[McapMessage]:
     """Yield beliefs about the floors, slip and speeds of the wheels from the estimator."""
     some = found.rows(_apart(found.time))
     e, drives = some.estimate, _drives(view)
     floors = (*e.labels, NO_FLOOR)
     belief = np.asarray(e.surface_probability).mean(axis=1)
-    channel = Channel("/floor/probability", "1", "probability of each floor, mean over the wheels")
+    channel = McapChannel(
+        "/floor/probability", "1", "probability of each floor, mean over the wheels"
+    )
     yield from _rows(channel, "FloorProbability", floors, some.time, belief)
     wheels = [f"wheel_{k}" for k in range(1, e.surface.shape[1] + 1)]
-    channel = Channel("/floor/under_wheels", "name", "most probable floor under each wheel")
+    channel = McapChannel("/floor/under_wheels", "name", "most probable floor under each wheel")
     yield from _rows(channel, "FloorUnderWheels", wheels, some.time, e.surface)
-    channel = Channel("/slip_ratio", "1", "slip ratio of each wheel by the estimator")
+    channel = McapChannel("/slip_ratio", "1", "slip ratio of each wheel by the estimator")
     yield from _rows(channel, "SlipRatio", drives, some.time, np.asarray(e.slip))
-    channel = Channel("/wheel_speed_rad_s", "rad/s", "speed of each wheel")
+    channel = McapChannel("/wheel_speed_rad_s", "rad/s", "speed of each wheel")
     yield from _rows(channel, "WheelSpeed", drives, some.time, np.asarray(e.wheel_speed))
 
 
-def _currents(view: RunView) -> Iterator[Message]:
+def _currents(view: RunView) -> Iterator[McapMessage]:
     """Yield the measured motor currents or torques, in the rows with a new reading."""
     log = view.log
     if log.current is None:
@@ -174,9 +178,9 @@ def _currents(view: RunView) -> Iterator[Message]:
     rows = np.flatnonzero(fresh.any(axis=1))
     rows = rows[_apart(log.time[rows])]
     read = np.where(fresh, log.current, np.nan)[rows]
-    channel, kind = Channel("/current_a", "A", "measured motor currents"), "Current"
+    channel, kind = McapChannel("/current_a", "A", "measured motor currents"), "Current"
     if log.current_is_torque:
-        channel, kind = Channel("/torque_nm", "N m", "measured torques at the wheels"), "Torque"
+        channel, kind = McapChannel("/torque_nm", "N m", "measured torques at the wheels"), "Torque"
     yield from _rows(channel, kind, _drives(view), log.time[rows], read)
 
 
@@ -192,13 +196,13 @@ def _apart(time: Float[np.ndarray, " row"]) -> np.ndarray:
 
 
 def _rows(
-    channel: Channel, kind: str, names: Sequence[str], time: np.ndarray, values: np.ndarray
-) -> Iterator[Message]:
+    channel: McapChannel, kind: str, names: Sequence[str], time: np.ndarray, values: np.ndarray
+) -> Iterator[McapMessage]:
     """Yield a message for every row of numbers or of words, with a field for every column."""
     fields = _field_names(names)
     made = _record(kind, fields, values.dtype.kind == "U")
     for t, row in zip(time.tolist(), values.tolist(), strict=True):
-        yield Message(t, channel, made(**dict(zip(fields, row, strict=True))))
+        yield McapMessage(t, channel, made(**dict(zip(fields, row, strict=True))))
 
 
 def _field_names(names: Iterable[str]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.app.mcap_file import Topic
+    from slipid.app.mcap_file import McapTopic
     from slipid.report.page import Page
 
 
@@ -36,11 +36,14 @@ def export_run(
 ) -> int:
     """Write a run and its predictions as an MCAP file, for Foxglove and rerun.
 
-    Topics: /pose/NAME, /path/NAME and a frame in /tf for NAME = measured, nominal (lengths of the
-    config), calibrated, selected (model selected on the floor) and estimator (robot.json run over
-    the log); /region90/selected and /region90/estimator; /floor_map; and for plots
-    /floor/probability, /floor/under_wheels, /slip_ratio, /wheel_speed_rad_s and /current_a (A).
-    Positions are in metres, times are those of the log, and poses are earlier by their lag.
+    Topics (docs/mcap.md): /pose, /path, /robot and frames in /tf, for each of
+    measured, nominal (lengths of the config), calibrated, selected (the model
+    selected on the floor) and estimator (robot.json run over the log) (m);
+    /region90/selected and /region90/estimator (m); /floor_map (m);
+    /floor/probability and /floor/under_wheels; /slip_ratio,
+    /wheel_speed_rad_s and /current_a (A) for each wheel.
+
+    Times are those of the log; poses are earlier than logged by their lag.
     """
     from slipid.app.mcap_file import mcap_of, require_mcap
     from slipid.app.run_view import run_view
@@ -70,7 +73,7 @@ def export_run(
     return 0
 
 
-def show(page: "Page", topics: "tuple[Topic, ...]", notes: tuple[str, ...]) -> None:
+def show(page: "Page", topics: "tuple[McapTopic, ...]", notes: tuple[str, ...]) -> None:
     """Print the topics of the file, and notes about what is missing."""
     from slipid.report.page import table
 
