@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from slipid.app.reference_robots import ReferenceBand, reference_bands
+from slipid.app.reference_robots import ReferenceBand, reference_bands, reference_robot
 from slipid.report.html import figures as draw
 from slipid.report.html.blocks import (
     Block,
@@ -33,9 +33,7 @@ OTHERS = {
 def others(found: Results) -> PageSection | None:
     """Return the section about how this robot compares with reference robots."""
     errors = found.trust.get("held_out_error_over_path")
-    bands = {
-        m: reference_bands(found.drive, f"trust.held_out_error_over_path.*.{m}") for m in ERRORS
-    }
+    bands = {m: _bands(found, f"trust.held_out_error_over_path.*.{m}") for m in ERRORS}
     if not errors or not bands["selected"]:
         return None
     blocks: list[Block] = [
@@ -49,6 +47,13 @@ def others(found: Results) -> PageSection | None:
         _numbers(found),
     ]
     return PageSection("others", "Is this good?", blocks)
+
+
+def _bands(found: Results, path: str) -> tuple[ReferenceBand, ...]:
+    """Return a number of similar robots, without those that were identified from these logs."""
+    mine = found.run["data"]["hash"]
+    every = reference_bands(found.drive, path)
+    return tuple(b for b in every if reference_robot(b.robot).source.data_hash != mine)
 
 
 def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> FigureBlock:
@@ -100,7 +105,7 @@ def _rows(found: Results, path: str, text: str) -> Iterator[Sequence[Cell]]:
     for floor in found.floors:
         if (own := _own(found, path.replace("*", floor))) is not None:
             yield text, f"this robot, {floor}", number(own[0], 3), interval(own[1], 3)
-    for band in reference_bands(found.drive, path):
+    for band in _bands(found, path):
         where = f"{band.robot}, {band.floor.replace('_', ' ')}"
         yield text, where, number(band.value, 3), interval(band.interval90, 3)
 
