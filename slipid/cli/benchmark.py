@@ -5,7 +5,19 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, flag, guarded, option
+from slipid.cli.common import (
+    Jobs,
+    Json,
+    Next,
+    Out,
+    Quiet,
+    emit,
+    executor_of,
+    flag,
+    guarded,
+    option,
+    suggest,
+)
 from slipid.support.extras import require
 from slipid.support.progress import Reporter
 
@@ -43,8 +55,10 @@ def benchmark(
         found = run(BenchmarkOptions(data, out, only, quick), executor, report)
         report.stage("drawing")
         written = write_page(found, benchmark_pictures(found), out)
-        report.line(f"written to {out}: benchmark.json, {written.name}")
-    emit(json, found, lambda page: show_benchmark(page, found))
+    words = ("compare", "robot.toml", "--data", "logs", "--out", "out/compare")
+    step = Next("compare slip models on your own logs", words)
+    files = (written.name, "benchmark.json")
+    emit(json, found, lambda page: show_benchmark(page, found), [step], out, files)
     every = [
         row
         for one in found["sets"].values()
@@ -73,4 +87,5 @@ def paper(
 
     for path in run(data, out):
         typer.echo(str(path))
+    suggest([Next("compare it with other systems", ("benchmark", "--data", data))])
     return 0
