@@ -17,7 +17,7 @@ NEWEST = $(shell \
   done)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test quick newest every nightly check bench format clean
+.PHONY: help demo docs test quick newest every nightly check bench format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | awk -F '\t' '{printf "make %-8s %s\n", $$1, $$2}'
@@ -25,6 +25,10 @@ help: ## this list
 
 demo: $(VENV)/.run-stamp ## the main job on logs of the virtual test site, pictures in demo_out
 	$(BIN)/slipid demo --out demo_out
+
+docs: $(VENV)/.dev-stamp ## the documentation site in docs/_build/html, without a warning and without a network
+	$(BIN)/python -m sphinx -b html docs docs/_build/html -W --keep-going -q
+	@echo "look at docs/_build/html/index.html"
 
 # Types are checked at run time by `check` and `nightly`: with it Python code takes twice as long.
 test: $(VENV)/.dev-stamp ## the test suite but for what is nightly, a file at a time on two cores
@@ -66,7 +70,7 @@ format: $(VENV)/.dev-stamp ## rewrite the sources in the project's format
 
 clean: ## remove the environment, the caches and demo_out (never out/)
 	rm -rf $(VENV) $(VENV)-newest .cache .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
-	rm -rf demo_out build dist *.egg-info
+	rm -rf demo_out build dist docs/_build *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The demo needs the library with all of its extras; tests and checks need the tools too.

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from slipid.api.runs import check as check
     from slipid.api.runs import simulate_runs as simulate_runs
     from slipid.api.runs import steady_motion as steady_motion
+    from slipid.app.reference_robots import reference_robot as reference_robot
+    from slipid.app.reference_robots import reference_robots as reference_robots
     from slipid.camera.overhead import OverheadCamera as OverheadCamera
     from slipid.camera.tracking.tracking import LoneMarker as LoneMarker
     from slipid.data.reading.presets import layout as layout
@@ -66,6 +68,8 @@ _ROOMS = {
     "layout": "slipid.data.reading.presets",
     "plot_runs": "slipid.plots.fit",
     "read_runs": "slipid.data.reading.reader",
+    "reference_robot": "slipid.app.reference_robots",
+    "reference_robots": "slipid.app.reference_robots",
     "setup_jax": "slipid.support.jax_setup",
     "simulate_runs": "slipid.api.runs",
     "steady_motion": "slipid.api.runs",

@@ -20,7 +20,7 @@ EXTRA = (
 DRAW_OR_SAMPLE = {
     "slipid.app.sample",
     *(f"slipid.infer.posterior.{name}" for name in ("ensemble", "proposals", "sample")),
-    *(f"slipid.lab.{name}" for name in ("benchmark.report", "paper2021.plots", "trial.plots")),
+    *(f"slipid.lab.{name}" for name in ("paper2021.plots", "trial.plots")),
 }
 """Modules outside `slipid.plots` that need such a package: commands look for it before."""
 HEAVY = ["jax", "equinox", "optimistix", "scipy", "matplotlib", "pydantic", "pint", "typer", "rich"]

@@ -260,11 +260,11 @@ RECORDED = Path(__file__).with_name("recorded.zip")
 
 
 def packaged_path(name: str) -> Path:
-    """Return the path of a config, or of another file in its folder, that ships with slipid."""
+    """Return the path of a config, or of something else in its folder, that ships with slipid."""
     package = Path(__file__).parents[1]
     # In a clone of the repository the folder is beside the package, in an installation inside it.
     for folder in (package / "configs", package.parent / "configs"):
-        if (folder / name).is_file():
+        if (folder / name).exists():
             return folder / name
     raise FileNotFoundError(f"{name} is missing from this installation of slipid")
 

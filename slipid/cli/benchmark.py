@@ -47,17 +47,17 @@ def benchmark(
     require("sklearn", "benchmark", "`slipid benchmark`")
     require("matplotlib", "benchmark", "`slipid benchmark`")
     from slipid.lab.benchmark.benchmark import benchmark as run
-    from slipid.lab.benchmark.report import benchmark_pictures, show_benchmark, write_page
+    from slipid.lab.benchmark.report import PAGE, benchmark_page, show_benchmark
     from slipid.lab.benchmark.work import BenchmarkOptions
+    from slipid.report.html.page import try_page
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
         found = run(BenchmarkOptions(data, out, only, quick), executor, report)
-        report.stage("drawing")
-        written = write_page(found, benchmark_pictures(found), out)
+        report.stage("writing the page")
+        files = (*try_page(benchmark_page(found), out / PAGE, report), "benchmark.json")
     words = ("compare", "robot.toml", "--data", "logs", "--out", "out/compare")
     step = Next("compare slip models on your own logs", words)
-    files = (written.name, "benchmark.json")
     emit(json, found, lambda page: show_benchmark(page, found), [step], out, files)
     every = [
         row

@@ -44,9 +44,12 @@ def check(
         logs, found = checks.check(config, data, out, report)
         if out is not None:
             from slipid.report.html.check_page import check_page
-            from slipid.report.html.page import try_page
+            from slipid.report.html.page import REPORT, try_page
 
-            written = (*try_page(check_page(logs, found, config.name), out, report), "check.json")
+            written = (
+                *try_page(check_page(logs, found, config.name), out / REPORT, report),
+                "check.json",
+            )
             if can_draw(report):
                 from slipid.plots.fit import raw_plots
 
@@ -71,9 +74,12 @@ def bench(config: "Config", data: Path, out: Path | None, json: str | None, quie
         fit, found = check_bench(config, data, out, report)
         if out is not None:
             from slipid.report.html.bench_page import bench_page
-            from slipid.report.html.page import try_page
+            from slipid.report.html.page import REPORT, try_page
 
-            written = (*try_page(bench_page(fit, config.path.name), out, report), "check.json")
+            written = (
+                *try_page(bench_page(fit, config.path.name), out / REPORT, report),
+                "check.json",
+            )
             if can_draw(report):
                 from slipid.plots.bench import bench_plots
 

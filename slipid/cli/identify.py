@@ -171,7 +171,7 @@ def bench(
     from slipid.app.bench import identify_bench
     from slipid.report.estimates import show_bench
     from slipid.report.html.bench_page import bench_page
-    from slipid.report.html.page import try_page
+    from slipid.report.html.page import REPORT, try_page
 
     if profile:
         raise DataError("--profile is not available for drive = 'motor'; omit it")
@@ -182,6 +182,6 @@ def bench(
 
             written = (*written, *(path.name for path in bench_plots(fit, out)))
         page = bench_page(fit, config.path.name)
-        written = (*try_page(page, out, report), *written)
+        written = (*try_page(page, out / REPORT, report), *written)
     emit(json, fit.to_json(), lambda page: show_bench(page, fit), [PRIORS], out, written)
     return 0 if fit.good else 1

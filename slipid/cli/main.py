@@ -27,6 +27,7 @@ from slipid.cli.map import map_
 from slipid.cli.motor import motor
 from slipid.cli.new import new, reference
 from slipid.cli.report import report
+from slipid.cli.robots import robots
 from slipid.cli.sample import sample
 from slipid.cli.selftest import selftest
 from slipid.cli.simulate import simulate
@@ -56,6 +57,9 @@ PANELS: dict[str, tuple[Command, ...]] = {
     "Start": (
         Command(demo, "Identify a robot from logs that ship with slipid", "slipid demo"),
         Command(new, "Write a config for your robot, from its logs", "slipid new --from logs"),
+        Command(
+            robots, "Show well-known robots, identified from public logs", "slipid robots husky"
+        ),
         Command(
             reference, "List every key, channel, unit and parameter", "slipid reference channels"
         ),

@@ -76,14 +76,15 @@ def motor(
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:
             from slipid.report.html.bench_page import bench_page
-            from slipid.report.html.page import try_page
+            from slipid.report.html.page import REPORT, try_page
 
             write_json(out / "motor.json", content)
             if can_draw(report):
                 from slipid.plots.bench import bench_plots
 
                 written += [path.name for path in bench_plots(fit, out)]
-            written[:0] = try_page(bench_page(fit, file.name, task.columns_used), out, report)
+            page = bench_page(fit, file.name, task.columns_used)
+            written[:0] = try_page(page, out / REPORT, report)
     used = task.columns_used
     emit(json, content, lambda page: show_bench(page, fit, used), [PRIORS], out, written)
     return 0 if fit.good else 1

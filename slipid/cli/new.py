@@ -31,6 +31,10 @@ def new(
             "--from",
         ),
     ] = None,
+    robot: Annotated[
+        Text,
+        _text("Reference robot that gives sizes and start values; `slipid robots` lists them."),
+    ] = None,
     drive: Annotated[
         Text,
         _text("Type of the wheels: omni, mecanum, skid, differential, steered or general."),

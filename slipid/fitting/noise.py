@@ -257,14 +257,20 @@ def encoder_increments(
 
 
 def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance of each window by the encoders (segment, window) [m], and its direction.
+    """Return the distance of each window by the encoders, and its direction, see `travelled`."""
+    return travelled(encoder_increments(windows, robot), float(robot.geometry.base_radius))
+
+
+def travelled(
+    step: Float[np.ndarray, "segment window 3"], base_radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance of increments (segment, window) [m], and their direction.
 
     The distance includes the turn in radians times the base radius. The direction is a unit vector
     in the body frame (segment, window, 2); it is (1, 0) if the robot turns on the spot.
     """
-    step = encoder_increments(windows, robot)
     distance = np.linalg.norm(step[..., :2], axis=-1)
-    turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
+    turned = np.abs(step[..., 2]) * base_radius
     direction = step[..., :2] / np.maximum(distance, 1e-9)[..., None]
     return distance + turned, np.where(distance[..., None] > 1e-6, direction, [1.0, 0.0])
 

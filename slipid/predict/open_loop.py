@@ -181,6 +181,7 @@ def path_covariance(
     shared: Float[np.ndarray, "segment 3 3"],
     of_parameters: Float[np.ndarray, "segment 2 2"],
     edge: int = -1,
+    motion: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Float[np.ndarray, "segment 2 2"]:
     """Return the scale matrices of the Student t of predicted less measured points of paths [m^2].
 
@@ -196,8 +197,9 @@ def path_covariance(
         shared: covariance of the shared effects along, across and in yaw.
         of_parameters: covariance of the points due to uncertain parameters.
         edge: index of the point on the path, by default its end.
+        motion: distance and direction of every window, by default those by the encoders.
     """
-    far, u = travel(w, robot)
+    far, u = motion or travel(w, robot)
     p = tracks.predicted[:, : edge % tracks.predicted.shape[1] + 1]
     far, u = far[:, : p.shape[1] - 1], u[:, : p.shape[1] - 1]
     cov = of_parameters.copy()

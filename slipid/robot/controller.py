@@ -23,7 +23,7 @@ cannot drive sideways and stands beside a resting reference first turns towards 
 Source: Kanayama et al. 1990, ICRA; their damping vanishes at rest, which k_yaw prevents.
 
 The "2021 paper" here and in other modules is Belyaev, Brylev and Ivanov (2021), see
-docs/results.md.
+docs/history.md.
 """
 
 from collections.abc import Callable

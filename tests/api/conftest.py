@@ -1,4 +1,4 @@
-"""The README's example, run once for every file of this folder."""
+"""The example of `docs/python.md`, run once for every file of this folder."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ DRIVES = heading_grid(setups=FLOORS, headings=6, speeds=(0.1, 0.3), turns=0)
 
 
 def example() -> str:
-    """The Python example of the README."""
-    return re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)[0]
+    """The Python example of `docs/python.md`."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.S)[0]
 
 
 def write_runs(folder: Path) -> None:
@@ -35,7 +35,7 @@ def write_runs(folder: Path) -> None:
 
 @pytest.fixture(scope="session")
 def world(tmp_path_factory) -> dict:
-    """Names that the README's example leaves behind, run where its logs are; few steps sampled."""
+    """Names that the example leaves behind, run where its logs are; few steps sampled."""
     folder = tmp_path_factory.mktemp("readme")
     write_runs(folder / "logs")
     around = sample.sampled
@@ -47,6 +47,6 @@ def world(tmp_path_factory) -> dict:
         patch.setattr(
             sample, "sampled", lambda fit, plan, draws, *rest: around(fit, plan, 16, *rest)
         )
-        exec(compile(example(), "README.md", "exec"), names)
+        exec(compile(example(), "docs/python.md", "exec"), names)
     names["folder"] = folder
     return names

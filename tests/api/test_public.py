@@ -1,4 +1,4 @@
-"""The README's example, word by word, and the rest of the public interface."""
+"""The example of `docs/python.md`, word by word, and the rest of the public interface."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.api.conftest import write_runs
 
 
 @pytest.mark.slow
-def test_the_example_of_the_readme_runs(world):
+def test_the_example_of_the_docs_runs(world):
     assert (world["folder"] / "robot.json").is_file()
     assert np.shape(world["estimate"].pose) == (3,)
     assert set(world["estimate"].surface) <= {"gray", "unknown"}

@@ -40,6 +40,7 @@ import pytest
 from tests.benchmarks.every_robot import drive, fits, rivals, score
 from tests.benchmarks.every_robot.robots import ROBOTS, MadeRobot
 from tests.benchmarks.quick import quick
+from tests.benchmarks.record import record
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = [*(ROOT / "slipid").rglob("*.py"), *(ROOT / "tests/benchmarks/every_robot").glob("*.py")]
@@ -120,6 +121,12 @@ def mean_rows(records: list[dict]) -> dict[str, float]:
     return {name: float(np.mean([rows[name] for rows in each])) for name in names}
 
 
+def recorded(rows: dict[str, float]) -> list[float | None]:
+    """Return the errors of a robot in the order of the documentation's columns [%]."""
+    shown = "nominal", "squares", "calibrated", "contact", "selected", "floor"
+    return [round(rows[name], 2) if name in rows else None for name in shown]
+
+
 def line(records: list[dict]) -> str:
     """One line of the table."""
     rows = mean_rows(records)
@@ -157,6 +164,7 @@ def test_table() -> None:
     late = [sentence for records in found.values() if (sentence := behind(records))]
     print(f"slipid is behind on {len(late)} of {len(found)} robots", *late, sep="\n  ")
     table = {name: mean_rows(records) for name, records in found.items()}
+    record("every_robot", ([name, *recorded(rows)] for name, rows in table.items()))
     content = {"rows": table, "behind": late, "records": found}
     (OUT / "every_robot.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
     assert quick(len(found) == len(ROBOTS) and not late, True)

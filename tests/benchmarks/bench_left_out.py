@@ -31,8 +31,23 @@ from slipid.predict.ranking import Ranking, compared, ranking
 from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick
+from tests.benchmarks.record import record
 
 ROOT = Path(__file__).resolve().parents[2]
+SHOWN = {
+    "encoder": "encoders",
+    "linear": "wheel by wheel, linear in torque",
+    "affine": "wheel by wheel, affine in torque",
+    "svr": "wheel by wheel, affine, support vectors",
+    "quadratic": "wheel by wheel, quadratic in torque",
+    "saturating": "wheel by wheel, saturating in torque",
+    "monotone_spline": "wheel by wheel, monotone spline in torque",
+    "affine_current": "wheel by wheel, affine in current",
+    "paper": "the form deployed in 2021, refitted per floor",
+    "heading_lookup": "lookup by heading",
+    "identified": "force balance (slipid)",
+}
+"""Models in the documentation's table, and their names there."""
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +98,19 @@ def some(job: ConfigFitTask, runs: np.ndarray) -> tuple[Runs, Problem]:
 def test_sectors(job: ConfigFitTask) -> None:
     floors = compared(job.problem(), job.choices, job.dataset, "sectors", 6, quiet=True).floors
     show("(a) left-out 60-degree sectors", floors)
+    record("left_out_sectors", recorded(floors))
     assert count(floors) == len(job.dataset)
+
+
+def recorded(floors: Mapping[str, Ranking]) -> list[list[str | float]]:
+    """Return the rows of the documentation's table: errors, and coverage of the regions [%]."""
+    order = [floors[name] for name in ("table", "brown", "gray", "green", "gray@moved")]
+    rows: list[list[str | float]] = [
+        [name, *(round(100 * floor.models[model].endpoint_error, 1) for floor in order)]
+        for model, name in SHOWN.items()
+    ]
+    inside = [round(100 * floor.models["identified"].coverage90) for floor in order]
+    return [*rows, ["end points inside the predicted 90 % region of slipid", *inside]]
 
 
 def test_random_headings(job: ConfigFitTask) -> None:

@@ -13,8 +13,15 @@ import os
 import numpy as np
 
 from tests.benchmarks.quick import QUICK, quick
+from tests.benchmarks.record import record
 
 MAPS, STARTS = quick(((101, 102, 103, 104), 12), ((101,), 2))
+SHOWN = {
+    "contact": "contact",
+    "contact_map": "contact, with the floor map",
+    "contact_gyro": "contact, with a gyro",
+}
+"""Controllers in the documentation's table, and their names there."""
 ROWS = ("encoder", "contact", "contact_map", "contact_gyro")
 
 
@@ -49,6 +56,11 @@ def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
             f" worse than they in {row['worse_share']:3.0%}, cross-track {across['value']:4.0%},"
             f" {row['finished_share']:4.0%} finish"
         )
+        if name in SHOWN:
+            shares = (row["worse_share"], across["value"], row["finished_share"])
+            wide = f"{100 * closes['value']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+            cells = [f"{100 * share:.0f} %" for share in shares]
+            record("trial_site", [[SHOWN[name], wide, *cells]])
     print("not told apart:", ", ".join(best_controllers(runs)))
     assert QUICK or min(row["finished_share"] for row in table.values()) > 0.9
     assert np.isfinite(base["closure_error_median"])

@@ -9,7 +9,7 @@ from slipid.app.new.config_lines import ConfigLine, toml
 from slipid.app.new.draft import ConfigDraft, LayoutDraft, LogsDraft
 from slipid.app.new.file_channels import common_glob, floor_of, rank
 from slipid.app.new.guess import guess_robot
-from slipid.app.new.robot_questions import RobotAnswers, RobotOptions
+from slipid.app.new.robot_answers import RobotAnswers, RobotOptions
 from slipid.app.reference.keys import in_short, meanings
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import Topic, topics_of

@@ -6,6 +6,7 @@ from pathlib import Path
 from slipid.app.config import LimitsSection, LogsSection, OmniDrive, Wheels, geometry, parsed
 from slipid.app.new.config_lines import ConfigBlock, ConfigLine, drawing, toml
 from slipid.app.new.draft import ConfigDraft, LogsDraft
+from slipid.app.new.from_reference import prior_text, remark, start_lines
 from slipid.app.new.robot_questions import robot_of
 from slipid.app.reference.keys import in_short
 
@@ -90,7 +91,8 @@ def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock
     for key in ("drive", *own, *common):
         comment = _ORDER[robot.drive] if key == "drive" else in_short(type(robot), key)
         lines.append(ConfigLine(key, toml(given[key]), comment, _open_question(draft, key)))
-    return ConfigBlock("[robot]", tuple(lines), above=(*picture.splitlines(), "", FRAME))
+    above = (remark(draft.robot.robot), "") if draft.robot.robot else ()
+    return ConfigBlock("[robot]", tuple(lines), above=(*above, *picture.splitlines(), "", FRAME))
 
 
 def _limits_block(robot: Wheels) -> ConfigBlock:
@@ -148,15 +150,19 @@ def _weights_block(wheels: int) -> ConfigBlock:
     return ConfigBlock("", lines, above=above)
 
 
-def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
-    """Return the table `[parameters]`, with choices that suit logs with the given channels."""
+def _parameters_block(channels: frozenset[str], robot: str) -> ConfigBlock:
+    """Return the table `[parameters]`, with choices that suit logs with the given channels.
+
+    `robot` is the reference robot that gives start values; empty without one.
+    """
     free, fixed = "{ free = true }", "{ free = false }"
     lines = [ConfigLine('"camera.marker_yaw"', free, "marker's heading less the robot's [rad]")]
     if "current" in channels:
         voltage = "voltage" in channels or {"duty", "bus_voltage"} <= channels
-        ask = "" if voltage else _DATASHEET
-        resistance = "{ prior = { mean = 1.0, std = 0.5 } }"
-        emf = "{ prior = { mean = 0.05, std = 0.025 } }"
+        known = prior_text(robot, "motor.resistance")
+        ask = "" if voltage or known else _DATASHEET
+        resistance = known or "{ prior = { mean = 1.0, std = 0.5 } }"
+        emf = prior_text(robot, "motor.back_emf") or "{ prior = { mean = 0.05, std = 0.025 } }"
         lines += [
             ConfigLine('"motor.resistance"', resistance, "[ohm], datasheet", ask),
             ConfigLine('"motor.back_emf"', emf, "[V s/rad]"),
@@ -166,6 +172,7 @@ def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
             ConfigLine('"motor.*"', fixed, "no current: motors unknown"),
             ConfigLine('"surface.*.friction"', fixed, "nor the friction of floors"),
         ]
+    lines += start_lines(robot, channels)
     above = (
         "Patterns of parameter names. fixed = value; start = value; free = true or false; prior is "
         "Gaussian in the parameter's own unit. `slipid reference parameters` lists the names.",
@@ -210,7 +217,7 @@ def new_config(draft: ConfigDraft, name: str) -> NewConfig:
         *(_logs_block(logs, first=k == 0) for k, logs in enumerate(draft.logs)),
         _FIT,
         *([] if robot.drive == "steered" else [_weights_block(geometry(robot).wheels)]),
-        _parameters_block(draft.channels),
+        _parameters_block(draft.channels, draft.robot.robot),
     ]
     text = "\n\n".join(block.text() for block in blocks) + "\n"
     parsed(Path(name), text)

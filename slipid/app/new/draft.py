@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from slipid.app.new.config_lines import ConfigBlock, ConfigLine, toml
-from slipid.app.new.robot_questions import RobotAnswers
+from slipid.app.new.robot_answers import RobotAnswers
 from slipid.app.reference.keys import in_short
 from slipid.data.reading.layout import Layout
 

@@ -18,7 +18,7 @@ from slipid.app.new.file_study import (
     reading_rate,
     ticks_are_increments,
 )
-from slipid.app.new.robot_questions import RobotAnswers
+from slipid.app.new.robot_answers import RobotAnswers
 from slipid.app.new.units import (
     RADII,
     UnitGuess,

@@ -18,7 +18,9 @@ from slipid.app.new.file_channels import (
     pattern_beside,
 )
 from slipid.app.new.file_study import FileStudy, RunStudy, file_with_pose, study_file
-from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, ask
+from slipid.app.new.from_reference import with_reference
+from slipid.app.new.robot_answers import RobotAnswers, RobotOptions
+from slipid.app.new.robot_questions import ask
 from slipid.data.reading.layout import GROUPS
 from slipid.data.reading.table_format import format_of
 from slipid.data.reading.units import factor
@@ -46,6 +48,7 @@ def guess_robot(
     drive, hint = _likely_drive(wheels, drives_sideways(files))
     if any(one.find("steering_angle") is not None for one in files):
         drive, hint = "steered", "a steering angle is logged: steered, with which axle driven?"
+    options = with_reference(options)
     drive = options.get("drive", drive)
     if drive == "steered" and wheels == 2:
         options = {"encoders": "2", **options}

@@ -14,7 +14,8 @@ from slipid.app.new.file_channels import floor_of, folder_per_run, globs_of
 from slipid.app.new.file_draft import file_draft, radius_hint
 from slipid.app.new.file_study import FileStudy, RunStudy, file_with_pose
 from slipid.app.new.guess import SortedFiles, guess_robot, sort_files
-from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
+from slipid.app.new.robot_answers import RobotAnswers, RobotOptions
+from slipid.app.new.robot_questions import robot_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.bag.runs import PAUSE_S, runs_between_pauses

@@ -1,12 +1,34 @@
-"""Questions about a robot, of which the type of drive is the first, and parsing of the answers."""
+"""Questions about a robot, of which the type of drive is the first."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter
 
 from slipid.app.config import Wheels, geometry
+from slipid.app.new.from_reference import (
+    OPTION,
+    reference_options,
+    wheeled_names,
+    with_reference,
+)
+from slipid.app.new.robot_answers import (
+    FROM_LOGS,
+    RobotAnswers,
+    RobotOptions,
+    angles,
+    axle,
+    count,
+    not_negative,
+    one_or_two,
+    parts,
+    places,
+    positive,
+    positive_if_any,
+    rollers,
+    yes,
+)
 from slipid.support.errors import DataError, did_you_mean
 
 Asker = Callable[[str, str, str], str]
@@ -15,140 +37,7 @@ Asker = Callable[[str, str, str], str]
 Its arguments are the question, the default, and a message about what was wrong with the previous
 answer (empty at first).
 """
-RobotOptions = Mapping[str, str]
-"""Values of the command-line options that describe a robot, keyed by attribute of `RobotAnswers`.
-"""
 _SECTION: TypeAdapter[Wheels] = TypeAdapter(Annotated[Wheels, Field(discriminator="drive")])
-
-
-@dataclass(frozen=True)
-class RobotAnswers:
-    """Answers about a robot, from the user or by default; units are in the names."""
-
-    drive: str = "omni"
-    wheels: int = 3
-    azimuths_deg: tuple[float, ...] = ()
-    base_radius_m: float = 0.15
-    wheelbase_m: float = 0.3
-    track_m: float = 0.3
-    shared: bool = False
-    driven: str = "rear"
-    encoders: int = 1
-    places_m: tuple[tuple[float, ...], ...] = ()
-    directions_deg: tuple[float, ...] = ()
-    rollers_deg: tuple[float | None, ...] = ()
-    wheel_radius_m: float = 0.05
-    gear_ratio: float = 1.0
-    mass_kg: float = 10.0
-    ticks_per_revolution: float = 1000.0
-    speed_m_s: float | None = None
-    yaw_rate_rad_s: float | None = None
-    acceleration_m_s2: float | None = None
-    wheel_speed_rad_s: float | None = None
-    voltage_v: float | None = None
-    defaults: frozenset[str] = field(default_factory=frozenset)
-    """Names of the attributes that have a default value because there was no answer."""
-
-
-def positive(text: str, _: RobotAnswers) -> float:
-    """Return the number above 0 in an answer.
-
-    Like all parsers below, it raises `ValueError` for any other answer.
-    """
-    value = number(text)
-    if not 0 < value < float("inf"):
-        raise ValueError("expected a number above 0")
-    return value
-
-
-def not_negative(text: str, _: RobotAnswers) -> float:
-    """Return the number, 0 or more, in an answer."""
-    value = number(text)
-    if not 0 <= value < float("inf"):
-        raise ValueError("expected a number above 0, or 0 where there is none")
-    return value
-
-
-FROM_LOGS = "from the logs"
-"""Answer to a question about a limit that the logs are to show; an empty answer says the same."""
-
-
-def positive_if_any(text: str, answers: RobotAnswers) -> float | None:
-    """Return the number above 0 in an answer, or None if the logs are to show it."""
-    return None if text.strip() in ("", FROM_LOGS) else positive(text, answers)
-
-
-def number(text: str) -> float:
-    """Return the number in a string."""
-    try:
-        return float(text.strip().replace("_", "?"))
-    except ValueError:
-        comma = " with a decimal point" if "," in text else ""
-        raise ValueError(f"expected a number{comma}") from None
-
-
-def count(text: str, _: RobotAnswers) -> int:
-    """Return the number of wheels, from 3 to 12, in an answer."""
-    if not text.strip().isdecimal() or not 3 <= int(text) <= 12:
-        raise ValueError("expected a whole number from 3 to 12")
-    return int(text)
-
-
-def axle(text: str, _: RobotAnswers) -> str:
-    """Return the driven axle, rear or front, in an answer."""
-    word = text.strip().lower()
-    if word not in ("rear", "front"):
-        raise ValueError("expected rear or front")
-    return word
-
-
-def one_or_two(text: str, _: RobotAnswers) -> int:
-    """Return the number of encoders, 1 or 2, in an answer."""
-    if text.strip() not in ("1", "2"):
-        raise ValueError("expected 1 or 2")
-    return int(text)
-
-
-def yes(text: str, _: RobotAnswers) -> bool:
-    """Return True for the answer yes and False for no."""
-    word = text.strip().lower()
-    if word not in ("y", "yes", "true", "n", "no", "false"):
-        raise ValueError("expected yes or no")
-    return word in ("y", "yes", "true")
-
-
-def _parts(text: str) -> list[str]:
-    return text.replace(";", ",").split(",")
-
-
-def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
-    """Return an angle for every wheel [deg] from an answer with numbers separated by commas.
-
-    Semicolons are accepted as well.
-    """
-    found = tuple(number(part) for part in _parts(text))
-    if len(found) != answers.wheels:
-        raise ValueError(f"{len(found)} angles; expected {answers.wheels}, one per wheel")
-    return found
-
-
-def places(text: str, _: RobotAnswers) -> tuple[tuple[float, ...], ...]:
-    """Return the centres x, y of two or more wheels [m], written like `0.2,0.1; 0.2,-0.1`."""
-    found = tuple(tuple(number(c) for c in part.split(",")) for part in text.split(";"))
-    if len(found) < 2 or any(len(place) != 2 for place in found):
-        raise ValueError("expected x, y of each wheel, as in: 0.2, 0.1; 0.2, -0.1; -0.2, 0")
-    return found
-
-
-def rollers(text: str, answers: RobotAnswers) -> tuple[float | None, ...]:
-    """Return the roller angle of every wheel [deg] from an answer such as `45,none`.
-
-    The angle is None for a wheel without rollers.
-    """
-    words = [part.strip().lower() for part in _parts(text)]
-    if len(words) != answers.wheels:
-        raise ValueError(f"{len(words)} rollers; expected {answers.wheels}, one per wheel")
-    return tuple(None if word == "none" else number(word) for word in words)
 
 
 @dataclass(frozen=True)
@@ -182,6 +71,10 @@ def _drive(text: str, _: RobotAnswers) -> str:
             f"no such drive{did_you_mean(word, DRIVES)}; expected one of {', '.join(DRIVES)}"
         )
     return word
+
+
+def _drive_or_robot(text: str, answers: RobotAnswers) -> str:
+    return word if (word := text.strip().lower()) in wheeled_names() else _drive(text, answers)
 
 
 def _even_azimuths(answers: RobotAnswers) -> str:
@@ -293,9 +186,13 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
     Raises:
         DataError: an option is not a valid answer, or belongs to another type of drive.
     """
-    answers = _with_question(
-        RobotAnswers(drive=drive), replace(DRIVE, default=drive), options, asker
-    )
+    options = with_reference(options)
+    answers = RobotAnswers(robot=options.get(OPTION, ""), drive=drive)
+    answers = _with_question(answers, replace(_asked_drive(options), default=drive), options, asker)
+    suggested: RobotOptions = {}
+    if answers.drive not in DRIVES:
+        suggested = reference_options(answers.drive)
+        answers = replace(answers, robot=answers.drive, drive=suggested["drive"])
     counts = {"mecanum": 4, "skid": 4, "differential": 2}
     answers = replace(answers, wheels=counts.get(answers.drive, answers.wheels))
     limits = () if answers.drive == "steered" else LIMITS
@@ -305,19 +202,30 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
         asker = None  # options alone describe the robot, and the logs show its limits
     for question in questions:
         if question is _WHEELS and "azimuths_deg" in options and "wheels" not in options:
-            answers = replace(answers, wheels=len(_parts(options["azimuths_deg"])))
+            answers = replace(answers, wheels=len(parts(options["azimuths_deg"])))
             continue
-        answers = _with_question(answers, question, options, asker)
+        default = suggested.get(question.name)
+        answers = _with_question(answers, question, options, asker, default)
         if question is _PLACES:
             answers = replace(answers, wheels=len(answers.places_m))
     return answers
+
+
+def _asked_drive(options: RobotOptions) -> RobotQuestion:
+    """Return the question about the drive; a reference robot answers it as well, if it is asked."""
+    if "drive" in options:
+        return DRIVE
+    names = ", ".join(wheeled_names())
+    return replace(
+        DRIVE, text=f"{DRIVE.text},\n  or a robot to start from: {names}", read=_drive_or_robot
+    )
 
 
 def _refuse_other_drives(
     options: RobotOptions, drive: str, questions: tuple[RobotQuestion, ...]
 ) -> None:
     """Raise `DataError` for an option that this type of drive would ignore."""
-    for name in options.keys() - {"drive", *(question.name for question in questions)}:
+    for name in options.keys() - {OPTION, "drive", *(question.name for question in questions)}:
         expected = ", ".join(question.option for question in questions)
         raise DataError(
             f"--{name.replace('_', '-')}: not an option for drive {drive}; known: {expected}"
@@ -325,12 +233,16 @@ def _refuse_other_drives(
 
 
 def _with_question(
-    answers: RobotAnswers, question: RobotQuestion, options: RobotOptions, asker: Asker | None
+    answers: RobotAnswers,
+    question: RobotQuestion,
+    options: RobotOptions,
+    asker: Asker | None,
+    default: str | None = None,
 ) -> RobotAnswers:
     """Return the answers, with the answer to one more question added.
 
     The answer comes from the options; else from `asker`, which is called until the answer is valid;
-    or it is the default if `asker` is None.
+    or it is the default if `asker` is None. `default` replaces the default of the question.
     """
 
     def read(text: str) -> RobotAnswers:
@@ -342,7 +254,9 @@ def _with_question(
             return read(text)
         except ValueError as error:
             raise DataError(f"{question.option} '{text}': {error}") from None
-    default = question.default if isinstance(question.default, str) else question.default(answers)
+    if default is None:
+        usual = question.default
+        default = usual if isinstance(usual, str) else usual(answers)
     if asker is None:
         answers = replace(answers, defaults=answers.defaults | {question.name})
         return read(default)

@@ -104,7 +104,7 @@ class BenchRecord:
         return float(np.median(np.diff(self.time)))
 
 
-def noise(signals: Sequence[Float[np.ndarray, " row"]]) -> float:
+def noise(signals: Sequence[Float[np.ndarray, "_"]]) -> float:
     """Return the std of white noise from second differences, at least that of rounding.
 
     For white noise, (x_k-1 - 2 x_k + x_k+1) / sqrt(6) has the same std as x; its median is not

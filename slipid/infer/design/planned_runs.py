@@ -119,7 +119,7 @@ def heading_grid(
 ) -> tuple[PlannedRun, ...]:
     """Return straight runs in headings 5 degrees apart at every speed, as in the 2022 logs.
 
-    docs/results.md describes these logs.
+    docs/history.md describes these logs.
     """
     headings = np.radians(np.arange(0.0, 360.0, 5.0))
     return tuple(

@@ -1,25 +1,15 @@
-"""Tables and figures of the benchmark, on a terminal and on one page of HTML.
+"""Tables and figures of the benchmark, on a terminal and on one page of HTML."""
 
-Figures show the end-point errors of every row of the benchmark, one panel per protocol; the page
-embeds them.
-"""
-
-from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
-from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
-from rich.text import Text
+from rich.text import Text as Cell
 
-from slipid.plots import drawing
-from slipid.report.page import Page, table
+from slipid.report import page as terminal
+from slipid.report.html import figures as draw
+from slipid.report.html.blocks import Badge, Block, FigureBlock, PageSection, TableBlock, TextBlock
+from slipid.report.html.page import WebPage
 from slipid.support.content import Content
-from slipid.support.files import write_bytes
 
 COLUMNS: Mapping[str, tuple[str, float, int]] = {
     "endpoint_error": ("end point, %", 100.0, 1),
@@ -39,7 +29,7 @@ BRIEF = ("endpoint_error", "behind", "coverage90")
 """Fields that are shown as text; the HTML page has all of them."""
 
 
-def show_benchmark(page: Page, found: Content) -> None:
+def show_benchmark(page: terminal.Page, found: Content) -> None:
     """Print every table, best rows first, and the sentences that summarise the tables."""
     for name, one in found["sets"].items():
         for protocol, rows in one["protocols"].items():
@@ -47,9 +37,9 @@ def show_benchmark(page: Page, found: Content) -> None:
             title = f"\n{name}: {about}; end points over the {one['over']}"
             brief = [number for number in shown(rows) if number in BRIEF]
             head, body = methods(rows, brief, COSTS[1:2])
-            made = table(head, title, right=head[1:])
+            made = terminal.table(head, title, right=head[1:])
             for row, *cells in body:
-                made.add_row(Text(row), *cells)
+                made.add_row(Cell(row), *cells)
             page.table(made)
             page.line(f"{len(body)} methods; {PAGE} has all their errors and costs")
             for sentence in absent(rows):
@@ -58,7 +48,7 @@ def show_benchmark(page: Page, found: Content) -> None:
         if one.failure:
             page.line(f"\n{name}: {one.failure}")
             continue
-        made = table(one.head, f"\n{one.title}", right=one.head[1:])
+        made = terminal.table(one.head, f"\n{one.title}", right=one.head[1:])
         for of_row in one.body:
             made.add_row(*of_row)
         page.table(made)
@@ -222,143 +212,93 @@ LEGEND = (
     "energy of a run. Numbers: fitted parameters. Fit, step: time of one fit, and to predict one "
     "step of a run."
 )
-STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 92rem; margin: 2rem auto }
-body { padding: 0 1rem }
-h2 { margin-top: 2.5rem; border-bottom: 1px solid #ccc } h3 { margin-bottom: .3rem }
-.wide { overflow-x: auto } img { max-width: 100% }
-table { border-collapse: collapse; font-size: 13px; white-space: nowrap }
-th, td { text-align: right; padding: .15rem .6rem; border-bottom: 1px solid #eee }
-th:first-child, td:first-child { text-align: left; font-family: monospace }
-tr.own { background: #fdeee3; font-weight: 600 } .note { color: #666; font-size: 13px }
-"""
 
 
-def write_page(found: Content, pictures: Mapping[str, bytes], out: Path) -> Path:
-    """Write the HTML page of a benchmark's content to a folder and return the page's path."""
-    path = out / PAGE
-    write_bytes(path, page(found, pictures).encode())
-    return path
-
-
-def page(found: Content, pictures: Mapping[str, bytes]) -> str:
-    """Return the whole page: summary, then a picture and the tables of every data set.
-
-    Args:
-        found: content of benchmark.json.
-        pictures: content of PNG files, keyed by the name of the data set that each shows.
-    """
-    parts = [
-        "<!doctype html><html lang='en'><meta charset='utf-8'>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<title>Slip methods compared</title><style>{STYLE}</style>",
-        "<h1>Slip methods compared</h1>",
-        "<p>All methods were fitted to the same runs and predict other runs from the sensors of "
-        "the robot; the pose is only used at the start. Brackets contain 90&nbsp;% intervals by "
-        "resampling of runs; settings were selected on training runs only.</p>",
-        f"<p class='note'>{escape(LEGEND)}</p>",
-        "<h2>Summary</h2><ul>",
-        *(f"<li>{escape(sentence)}</li>" for sentence in found["reading"]),
-        "</ul>",
-    ]
-    for name, one in found["sets"].items():
-        parts += _set(found, name, one, pictures.get(name))
-    for name, other in others(found):
-        parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2>")
-        parts.append(f"<p>{escape(other.failure or other.title)}</p>")
-        if not other.failure:
-            parts.append(html_table(other.head, other.body))
+def benchmark_page(found: Content) -> WebPage:
+    """Return the page of benchmark.json: summary, then figures and tables of every data set."""
     names = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
-    note = escape(f"{names}; this call took {found['seconds']:.0f} s")
-    parts.append(f"<p class='note'>{note}</p></html>")
-    return "\n".join(parts)
+    origin = TextBlock([f"{names}; this call took {found['seconds']:.0f} s."], kind="note")
+    sections = [
+        PageSection("summary", "Summary", [TextBlock(found["reading"], listed=True)]),
+        *(_of_set(found, name, one) for name, one in found["sets"].items()),
+        *(_of_other(name, one) for name, one in others(found)),
+        PageSection("reading", "How to read the tables", [TextBlock([LEGEND]), origin]),
+    ]
+    lead = (
+        "All methods were fitted to the same runs and predict other runs from the sensors of the "
+        "robot; the pose is only used at the start. Brackets contain 90 % intervals by resampling "
+        "of runs; settings were selected on training runs only."
+    )
+    return WebPage("Slip methods compared", None, lead, sections)
 
 
-def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[str]:
-    parts = [f"<h2>{escape(name)}</h2><p>{escape(one['about'])}; {one['runs']} runs</p>"]
-    if drawn is not None:
-        data = b64encode(drawn).decode()
-        title = escape(f"End-point errors on {name}")
-        parts.append(f"<img alt='{title}' src='data:image/png;base64,{data}'>")
+def _of_set(found: Content, name: str, one: Content) -> PageSection:
+    """Return the section about a data set: a figure and a table for every protocol."""
+    blocks: list[Block] = [TextBlock([f"{one['about']}; {one['runs']} runs."])]
     for protocol, rows in one["protocols"].items():
         title = f"{protocol.replace('_', ' ')}: {found['protocols'][protocol]}"
-        parts.append(f"<h3>{escape(title)}</h3>")
-        parts.append(html_table(*methods(rows, shown(rows), COSTS)))
-        parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
+        if (figure := ranking_figure(rows, f"{name}_{protocol}", title, one["over"])) is not None:
+            blocks.append(figure)
+        blocks.append(_table(title, *methods(rows, shown(rows), COSTS)))
+        if lines := absent(rows):
+            blocks.append(TextBlock(lines, listed=True, kind="note"))
         if lines := settings_lines(rows):
-            parts.append("<details class='note'><summary>selected settings, fold by fold</summary>")
-            parts += [*(f"<div>{escape(line)}</div>" for line in lines), "</details>"]
-    return parts
+            body = [line.split(": ", 1) for line in lines]
+            title = "Settings that were selected, fold by fold."
+            blocks.append(TableBlock(title, ("row", "settings"), body, folded=True))
+    return PageSection(name, name.replace("_", " "), blocks)
 
 
-def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
-    """Return an HTML table with row names in the first column; slipid's rows are highlighted."""
-    lines = [
-        "<div class='wide'><table><tr>",
-        *(f"<th>{escape(cell)}</th>" for cell in head),
-        "</tr>",
-    ]
-    for row in body:
-        own = " class='own'" if row[0].startswith(("slipid", "contact")) else ""
-        lines.append(f"<tr{own}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
-    return "".join([*lines, "</table></div>"])
+def _of_other(name: str, one: ExtraTable) -> PageSection:
+    """Return the section about a table that does not belong to a data set."""
+    block: Block = TextBlock([one.failure], kind="warning")
+    if not one.failure:
+        block = _table(one.title, one.head, one.body)
+    return PageSection(name, name.replace("_", " "), [block])
 
 
-OWN_PREFIX = "slipid"
-"""Prefix of the names of rows that are highlighted."""
+OWN_PREFIX = ("slipid", "contact")
+"""Prefixes of the names of slipid's rows, which are highlighted."""
 
 
-def benchmark_pictures(found: Content) -> dict[str, bytes]:
-    """Draw a figure for each data set of benchmark.json; return PNG bytes by data set name."""
-    made = {n: benchmark_figure(one, found["protocols"], n) for n, one in found["sets"].items()}
-    return {name: drawing.png(figure) for name, figure in made.items() if figure is not None}
+def _table(title: str, head: tuple[str, ...], body: Sequence[tuple[str, ...]]) -> TableBlock:
+    """Return a table with row names in the first column; slipid's are highlighted."""
+    rows = [(Badge(n, "good") if n.startswith(OWN_PREFIX) else n, *cells) for n, *cells in body]
+    return TableBlock(title, head, rows, right=head[1:])
 
 
-def benchmark_figure(one: Content, about: Content, name: str) -> Figure | None:
-    """Return a figure of one data set: mean end-point errors with 90 % intervals, by protocol.
-
-    The figure is None if no row has an end-point error.
+def ranking_figure(rows: Content, name: str, title: str, over: str) -> FigureBlock | None:
+    """Return the figure of the end-point errors of one protocol, with 90 % intervals.
 
     Args:
-        one: content of a data set in benchmark.json.
-        about: descriptions of the protocols, keyed by name.
-        name: name of the data set.
+        rows: rows of the protocol.
+        name: identifier of the figure.
+        title: title, which describes the protocol.
+        over: what errors are divided by.
+
+    Returns:
+        None if no row has an end-point error.
     """
-    protocols = {
-        protocol: ends
-        for protocol, rows in one["protocols"].items()
-        if (ends := {n: row["endpoint_error"] for n, row in rows.items() if row["endpoint_error"]})
-    }
-    if not protocols:
+    ends = {n: row["endpoint_error"] for n, row in rows.items() if row["endpoint_error"]}
+    if not ends:
         return None
-    rows = max(len(ends) for ends in protocols.values())
-    made, axes = drawing.panels(
-        len(protocols),
-        4.6,
-        1.4 + 0.24 * rows,
-        f"{name}: {one['about']}\nmean end-point error over the {one['over']}, 90 % intervals",
-    )
-    for ax, (protocol, ends) in zip(axes, protocols.items(), strict=True):
-        _panel(ax, ends)
-        ax.set_title(about[protocol], fontsize=9, loc="left", wrap=True)
-    return made
-
-
-def _panel(ax: Axes, ends: Mapping[str, Sequence[float]]) -> None:
     order = sorted(ends, key=lambda row: -ends[row][0])
-    for k, row in enumerate(order):
-        middle, low, high = (100 * x for x in ends[row])
-        colour = drawing.ORANGE if row.startswith(OWN_PREFIX) else drawing.BLUE
-        ax.plot([low, high], [k, k], color=colour, lw=1.5)
-        ax.plot(middle, k, "o", color=colour, ms=4)
-    ax.set_yticks(np.arange(len(order)), order, fontsize=7)
-    for label in ax.get_yticklabels():
-        if label.get_text().startswith(OWN_PREFIX):
-            label.set_color(drawing.ORANGE)
-            label.set_fontweight("bold")
-    ax.set_xscale("log")
-    ax.set_xlabel("end-point error, %")
-    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.minorticks_off()
-    ax.set_ylim(-0.7, len(order) - 0.3)
+    data = []
+    for own, label, shade in ((True, "slipid", "@orange"), (False, "others", "@blue")):
+        mine = [n for n in order if n.startswith(OWN_PREFIX) is own]
+        middle = [100 * ends[n][0] for n in mine]
+        trace = draw.errors(middle, mine, [0.0] * len(mine), label, shade)
+        trace["error_x"] |= {
+            "symmetric": False,
+            "array": [100 * (ends[n][2] - ends[n][0]) for n in mine],
+            "arrayminus": [100 * (ends[n][0] - ends[n][1]) for n in mine],
+        }
+        data.append(trace)
+    layout = {
+        "xaxis": draw.axis(f"mean end-point error over the {over} [%]", type="log"),
+        "yaxis": {"automargin": True, "categoryorder": "array", "categoryarray": order},
+        "showlegend": True,
+    }
+    best = order[-1]
+    alt = f"{title}. The best of {len(order)} rows is {best}, off by {100 * ends[best][0]:.1f} %."
+    return FigureBlock(name, title, alt, data, layout, "", 130 + 19 * len(order), minimum=460)

@@ -14,23 +14,23 @@ from slipid.report.html.blocks import (
     Badge,
     Block,
     Cell,
-    Code,
-    Figure,
-    Section,
-    Table,
-    Text,
+    CopyLines,
+    FigureBlock,
+    PageSection,
+    TableBlock,
+    TextBlock,
     badge,
     interval,
     number,
 )
-from slipid.report.html.page import Page
+from slipid.report.html.page import WebPage
 from slipid.support.content import Content
 
 MOST_POINTS = 2000
 """Largest number of points of a curve, or of dots in a panel; longer signals are thinned."""
 
 
-def bench_page(fit: BenchFit, name: str, taken: Sequence[str] = ()) -> Page:
+def bench_page(fit: BenchFit, name: str, taken: Sequence[str] = ()) -> WebPage:
     """Return the page of fitted motors.
 
     Args:
@@ -41,7 +41,7 @@ def bench_page(fit: BenchFit, name: str, taken: Sequence[str] = ()) -> Page:
     word = "explains the log" if fit.good else "does not explain the log"
     rows = sum(len(r.time) for f in fit.fits for r in f.records)
     motors = "motor" if len(fit.fits) == 1 else f"{len(fit.fits)} motors"
-    return Page(
+    return WebPage(
         title=f"{name}: {motors} on a bench",
         badge=Badge(word, "good" if fit.good else "bad"),
         lead=f"Identified from {rows} rows; all values refer to the shaft of the motor.",
@@ -55,20 +55,20 @@ def bench_page(fit: BenchFit, name: str, taken: Sequence[str] = ()) -> Page:
     )
 
 
-def _verdict(fit: BenchFit) -> Section:
+def _verdict(fit: BenchFit) -> PageSection:
     if fit.good:
         text = "The model explains the log: use the identified numbers."
     elif fit.converged:
         text = "The model does not explain the log: the intervals are widened, use them with care."
     else:
         text = "The fit did not converge: do not use these numbers."
-    blocks: list[Block] = [Text([text], kind="good" if fit.good else "bad")]
+    blocks: list[Block] = [TextBlock([text], kind="good" if fit.good else "bad")]
     if fit.messages:
-        blocks.append(Text(fit.messages, listed=True, kind="note"))
-    return Section("verdict", "Verdict", blocks)
+        blocks.append(TextBlock(fit.messages, listed=True, kind="note"))
+    return PageSection("verdict", "Verdict", blocks)
 
 
-def _numbers(fit: BenchFit, name: str) -> Section:
+def _numbers(fit: BenchFit, name: str) -> PageSection:
     lines = [f"# {name}; 90 % intervals"]
     for path, e in fit.parameters.items():
         if e.verdict == "fixed":
@@ -77,26 +77,28 @@ def _numbers(fit: BenchFit, name: str) -> Section:
         if e.verdict != "identified":
             line = f"# {line}; {e.verdict.replace('_', ' ')}"
         lines.append(line)
-    about = Text(["Lines that begin with # are numbers that this log does not determine well."])
-    code = Code("Numbers to type in", "\n".join(lines))
-    return Section("numbers", "Type these numbers into your robot", [about, code])
+    about = TextBlock(
+        ["Lines that begin with # are numbers that this log does not determine well."]
+    )
+    code = CopyLines("Numbers to type in", "\n".join(lines))
+    return PageSection("numbers", "Type these numbers into your robot", [about, code])
 
 
-def _values(fit: BenchFit) -> Section:
+def _values(fit: BenchFit) -> PageSection:
     head = ("parameter", "value", "unit", "90 % interval", "prior", "verdict", "meaning")
     rows = [_row(e) for e in fit.parameters.values() if e.verdict != "fixed"]
     blocks: list[Block] = [
-        Table("Fitted numbers; the prior is what was known before.", head, rows, ("value",))
+        TableBlock("Fitted numbers; the prior is what was known before.", head, rows, ("value",))
     ]
     if fit.derived:
         ratios = [_row(e) for e in fit.derived.values()]
         caption = "Ratios of numbers, which a log may determine better than the numbers themselves."
-        blocks.append(Table(caption, head, ratios, ("value",)))
+        blocks.append(TableBlock(caption, head, ratios, ("value",)))
     fixed = [_row(e) for e in fit.parameters.values() if e.verdict == "fixed"]
     if fixed:
         caption = "Numbers that were given or have the default, and were not fitted."
-        blocks.append(Table(caption, head, fixed, ("value",), folded=True))
-    return Section("values", "Values and intervals", blocks)
+        blocks.append(TableBlock(caption, head, fixed, ("value",), folded=True))
+    return PageSection("values", "Values and intervals", blocks)
 
 
 def _row(e: Estimate) -> Sequence[Cell]:
@@ -106,7 +108,7 @@ def _row(e: Estimate) -> Sequence[Cell]:
     return e.path, number(e.value), e.unit, ends, prior, badge(e.verdict), e.doc
 
 
-def _signals(fit: MotorFit) -> Section:
+def _signals(fit: MotorFit) -> PageSection:
     """Return the section about measured and fitted signals of a motor, and their residuals."""
     which = f"_{fit.label}" if fit.label else ""
     title = f"Motor {fit.label}: signals" if fit.label else "Signals"
@@ -114,10 +116,10 @@ def _signals(fit: MotorFit) -> Section:
     for equation in fit.equations:
         blocks.append(_overlay(equation, which))
         blocks.append(_residuals(equation, which))
-    return Section(f"signals{which}", title, blocks)
+    return PageSection(f"signals{which}", title, blocks)
 
 
-def _overlay(equation: Equation, which: str) -> Figure:
+def _overlay(equation: Equation, which: str) -> FigureBlock:
     """Return the figure of a measured and a fitted signal over time."""
     w = equation.windows
     measured = w.measured.mean(axis=0)
@@ -139,10 +141,10 @@ def _overlay(equation: Equation, which: str) -> Figure:
     }
     alt = f"{title} (root mean square). Measured {channel} over time, and the one by the model."
     caption = "The model computes it from the other measured signals, row by row."
-    return Figure(f"{channel}{which}", title, alt, data, layout, caption, 330)
+    return FigureBlock(f"{channel}{which}", title, alt, data, layout, caption, 330)
 
 
-def _residuals(equation: Equation, which: str) -> Figure:
+def _residuals(equation: Equation, which: str) -> FigureBlock:
     """Return the figure of residuals over time, speed and current."""
     w = equation.windows
     residual = equation.residual.mean(axis=0)
@@ -164,7 +166,9 @@ def _residuals(equation: Equation, which: str) -> Figure:
     title = f"Residuals of the {equation.channel}"
     alt = f"{title} over time, speed and current, with their means in bins."
     caption = "Measured less fitted; orange: means. A trend is an effect that the model lacks."
-    return Figure(f"residual_{equation.channel}{which}", title, alt, data, layout, caption, 260)
+    return FigureBlock(
+        f"residual_{equation.channel}{which}", title, alt, data, layout, caption, 260
+    )
 
 
 def _binned(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> Iterator[tuple[float, float]]:
@@ -185,13 +189,17 @@ def _short(x: np.ndarray) -> list[float]:
     return [float(f"{v:.5g}") for v in x.tolist()]
 
 
-def _origin(fit: BenchFit, taken: Sequence[str]) -> Section:
+def _origin(fit: BenchFit, taken: Sequence[str]) -> PageSection:
     content: Content = fit.to_json()
     runs = dict.fromkeys((r.name, r.sha256) for f in fit.fits for r in f.records)
     rows: list[Sequence[Cell]] = [(name, sha[:16]) for name, sha in runs]
-    blocks: list[Block] = [Table("Logs and the hashes of their files.", ("log", "SHA-256"), rows)]
+    blocks: list[Block] = [
+        TableBlock("Logs and the hashes of their files.", ("log", "SHA-256"), rows)
+    ]
     if taken:
-        blocks += [Text(["Columns that were used:"]), Text(taken, listed=True)]
-    blocks.append(Text([f"{'Converged' if fit.converged else 'Not converged'}: {fit.reason}."]))
-    blocks.append(Text([f"Hash of the data: {content['data']['hash'][:16]}."]))
-    return Section("provenance", "Provenance", blocks)
+        blocks += [TextBlock(["Columns that were used:"]), TextBlock(taken, listed=True)]
+    blocks.append(
+        TextBlock([f"{'Converged' if fit.converged else 'Not converged'}: {fit.reason}."])
+    )
+    blocks.append(TextBlock([f"Hash of the data: {content['data']['hash'][:16]}."]))
+    return PageSection("provenance", "Provenance", blocks)

@@ -22,7 +22,7 @@ Cell = str | Badge
 
 
 @dataclass(frozen=True)
-class Text:
+class TextBlock:
     """A paragraph, or a list of sentences.
 
     Attributes:
@@ -38,7 +38,7 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Table:
+class TableBlock:
     """A table with a caption, which says in one sentence what it shows.
 
     Attributes:
@@ -58,7 +58,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Figure:
+class FigureBlock:
     """An interactive figure.
 
     Attributes:
@@ -97,7 +97,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class DrawingBlock:
     """A drawing in SVG.
 
     Attributes:
@@ -115,17 +115,7 @@ class Drawing:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture in PNG, as base64 text."""
-
-    title: str
-    alt: str
-    png: str
-    block: str = field(default="picture", init=False)
-
-
-@dataclass(frozen=True)
-class Code:
+class CopyLines:
     """Lines to copy.
 
     Attributes:
@@ -154,11 +144,11 @@ class Player:
     block: str = field(default="player", init=False)
 
 
-Block = Text | Table | Figure | Drawing | Picture | Code | Player
+Block = TextBlock | TableBlock | FigureBlock | DrawingBlock | CopyLines | Player
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A section of a page.
 
     Attributes:

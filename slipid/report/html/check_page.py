@@ -6,8 +6,18 @@ import numpy as np
 
 from slipid.data.runs import Runs
 from slipid.report.html import figures as draw
-from slipid.report.html.blocks import Badge, Block, Cell, Code, Figure, Section, Table, Text, badge
-from slipid.report.html.page import Page
+from slipid.report.html.blocks import (
+    Badge,
+    Block,
+    Cell,
+    CopyLines,
+    FigureBlock,
+    PageSection,
+    TableBlock,
+    TextBlock,
+    badge,
+)
+from slipid.report.html.page import WebPage
 from slipid.report.html.sections.summary import calibration_table
 from slipid.support.content import Content
 
@@ -17,7 +27,7 @@ MOST_DRAWN = 60
 """Largest number of drawn runs; of more, evenly spaced ones are drawn."""
 
 
-def check_page(data: Runs, found: Content, name: str) -> Page:
+def check_page(data: Runs, found: Content, name: str) -> WebPage:
     """Return the page of a check.
 
     Args:
@@ -37,7 +47,7 @@ def check_page(data: Runs, found: Content, name: str) -> Page:
         _expected(found),
         _settings(found),
     ]
-    return Page(
+    return WebPage(
         title=f"{name.removesuffix('.toml')}: its logs before a fit",
         badge=Badge(word, "bad" if bad else "good"),
         lead=f"{found['runs']} runs, {seconds / 60:.1f} minutes; {', '.join(found['channels'])}.",
@@ -45,24 +55,24 @@ def check_page(data: Runs, found: Content, name: str) -> Page:
     )
 
 
-def _findings(found: Content, bad: bool) -> Section:
+def _findings(found: Content, bad: bool) -> PageSection:
     text = (
         "Logs and config contradict each other: correct what is marked wrong before a fit."
         if bad
         else "Logs and config agree: `slipid identify` can follow."
     )
-    blocks: list[Block] = [Text([text], kind="bad" if bad else "good")]
+    blocks: list[Block] = [TextBlock([text], kind="bad" if bad else "good")]
     rows: list[Sequence[Cell]] = [
         (badge(f["severity"]), f["found"], f["remedy"] or "", _runs(f["runs"]))
         for f in found["findings"]
     ]
     if rows:
         head = ("severity", "what was found", "what to do", "runs")
-        blocks.append(Table("Findings, the worst first.", head, rows))
+        blocks.append(TableBlock("Findings, the worst first.", head, rows))
     notes = [*found.get("suspects", ()), *found["messages"]]
     if notes:
-        blocks.append(Text(notes, listed=True, kind="note"))
-    return Section("findings", "Findings", blocks)
+        blocks.append(TextBlock(notes, listed=True, kind="note"))
+    return PageSection("findings", "Findings", blocks)
 
 
 def _runs(names: Sequence[str]) -> str:
@@ -71,7 +81,7 @@ def _runs(names: Sequence[str]) -> str:
     return f"{', '.join(names[:2])}{more}" if names else "all"
 
 
-def _contents(found: Content) -> Section:
+def _contents(found: Content) -> PageSection:
     head = ("floor", "load", "session", "runs", "minutes", "headings", "speeds [m/s]")
     rows = [
         (
@@ -86,14 +96,20 @@ def _contents(found: Content) -> Section:
         for row in found["groups"]
     ]
     caption = "Runs by floor, load set-up and session; headings and speeds are commanded ones."
-    blocks: list[Block] = [Table(caption, head, rows, right=("runs", "minutes", "headings"))]
+    blocks: list[Block] = [TableBlock(caption, head, rows, right=("runs", "minutes", "headings"))]
     skipped = list(found.get("skipped", ()))
     if skipped:
-        blocks += [Text([f"{len(skipped)} files were set aside:"]), Text(skipped, listed=True)]
+        blocks += [
+            TextBlock([f"{len(skipped)} files were set aside:"]),
+            TextBlock(skipped, listed=True),
+        ]
     if found["notes"]:
         repaired = [f"in {count} runs: {note}" for note, count in found["notes"].items()]
-        blocks += [Text(["Repaired when the logs were read:"]), Text(repaired, listed=True)]
-    return Section("logs", "What was logged", blocks)
+        blocks += [
+            TextBlock(["Repaired when the logs were read:"]),
+            TextBlock(repaired, listed=True),
+        ]
+    return PageSection("logs", "What was logged", blocks)
 
 
 def _drawn(data: Runs) -> list[int]:
@@ -102,7 +118,7 @@ def _drawn(data: Runs) -> list[int]:
     return sorted(set(np.linspace(0, last, min(last + 1, MOST_DRAWN)).round().astype(int).tolist()))
 
 
-def _paths(data: Runs) -> Section | None:
+def _paths(data: Runs) -> PageSection | None:
     """Return the section with the logged paths from their start."""
     floors, traces, seen = list(dict.fromkeys(data.surface)), [], set()
     for k in _drawn(data):
@@ -131,10 +147,12 @@ def _paths(data: Runs) -> Section | None:
     title = f"Logged paths of {len(traces)} of {len(data)} runs, each from its start"
     alt = f"{title}. Lines of the measured positions."
     caption = "Positions as logged, before any correction; hover names the run."
-    return Section("paths", "Paths", [Figure("paths", title, alt, traces, layout, caption, 460)])
+    return PageSection(
+        "paths", "Paths", [FigureBlock("paths", title, alt, traces, layout, caption, 460)]
+    )
 
 
-def _signals(data: Runs) -> Section:
+def _signals(data: Runs) -> PageSection:
     """Return the section with the wheel speeds and currents of the drawn runs."""
     wheels = data.wheel_angle.shape[1]
     kinds = ["speed", *(["current"] if data.current is not None else [])]
@@ -165,17 +183,17 @@ def _signals(data: Runs) -> Section:
         layout[f"yaxis{axes[row * wheels]}"] |= draw.axis(unit)
     title = "Speeds" + (" and currents" if len(kinds) > 1 else "") + " of the drives over time [s]"
     alt = f"{title}, a panel for each drive, a line for each run."
-    figure = Figure("signals", title, alt, traces, layout, "", 60 + 220 * rows, minimum=560)
-    return Section("signals", "Signals of the wheels", [figure])
+    figure = FigureBlock("signals", title, alt, traces, layout, "", 60 + 220 * rows, minimum=560)
+    return PageSection("signals", "Signals of the wheels", [figure])
 
 
-def _calibration(found: Content) -> Section | None:
+def _calibration(found: Content) -> PageSection | None:
     if "calibration" not in found:
         return None
-    return Section("calibration", "Calibration", [calibration_table(found["calibration"])])
+    return PageSection("calibration", "Calibration", [calibration_table(found["calibration"])])
 
 
-def _expected(found: Content) -> Section | None:
+def _expected(found: Content) -> PageSection | None:
     """Return the section on how much a fit to these logs may tell of each parameter."""
     numbers = found["parameters"] | found.get("derived", {})
     rows: list[Sequence[Cell]] = []
@@ -196,18 +214,20 @@ def _expected(found: Content) -> Section | None:
         "What a fit to these logs can find, from the least to the most informative of plausible "
         "floors, motors and noise. Small ratios are good."
     )
-    return Section(
-        "expected", "What a fit can identify", [Table(caption, head, rows, right=head[2:3])]
+    return PageSection(
+        "expected", "What a fit can identify", [TableBlock(caption, head, rows, right=head[2:3])]
     )
 
 
-def _settings(found: Content) -> Section | None:
+def _settings(found: Content) -> PageSection | None:
     """Return the section with the limits and the noise that the logs show, for the config."""
     if not found.get("settings"):
         return None
     lines = []
     for group, values in found["settings"].items():
         lines += [f"[robot.{group}]", *(f"{key} = {value:g}" for key, value in values.items()), ""]
-    about = Text(["Limits and noise by these logs; `slipid identify` uses them without asking."])
-    code = Code("For the config", "\n".join(lines).strip())
-    return Section("settings", "Limits and noise", [about, code])
+    about = TextBlock(
+        ["Limits and noise by these logs; `slipid identify` uses them without asking."]
+    )
+    code = CopyLines("For the config", "\n".join(lines).strip())
+    return PageSection("settings", "Limits and noise", [about, code])

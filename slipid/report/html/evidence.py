@@ -1,4 +1,4 @@
-"""Evidence of a fit: what a report shows of the logs, so that it needs neither logs nor models.
+"""FitEvidence of a fit: what a report shows of the logs, so that it needs neither logs nor models.
 
 `identify` writes it to the result folder as evidence.json. Numbers are rounded to what a screen can
 show: millimetres, milliradians and hundredths.
@@ -34,7 +34,7 @@ class Track(_Record):
     yaw_mrad: list[int]
 
 
-class Region(_Record):
+class PointRegions(_Record):
     """The 90 % regions of some predicted points of a run, which are ellipses.
 
     Attributes:
@@ -56,7 +56,8 @@ class RunEvidence(_Record):
         name, floor, load: name of the run, its floor and its load set-up.
         heading_deg: commanded direction of travel [deg], None if unknown.
         speed: commanded speed [m/s], None if unknown.
-        seconds: duration [s].
+        seconds: duration from the first motion on [s].
+        rest_s: time in the whole run in which no wheel turns [s].
         path_m: measured path length [m].
         time_s: time of each pose [s].
         measured: measured poses.
@@ -71,11 +72,12 @@ class RunEvidence(_Record):
     heading_deg: float | None
     speed: float | None
     seconds: float
+    rest_s: float
     path_m: float
     time_s: list[float]
     measured: Track
     models: Mapping[str, Track]
-    region: Region | None
+    region: PointRegions | None
     selected: str
 
 
@@ -139,8 +141,8 @@ class CurrentDots(_Record):
     fitted: list[float]
 
 
-class Wheels(_Record):
-    """Wheels of the robot, seen from above.
+class WheelLayout(_Record):
+    """WheelLayout of the robot, seen from above.
 
     Attributes:
         place_m: position of each wheel ahead of and to the left of the middle [m].
@@ -169,7 +171,7 @@ class Correlations(_Record):
     percent: list[list[int]]
 
 
-class Evidence(_Record):
+class FitEvidence(_Record):
     """Everything that a report shows of the logs.
 
     Attributes:
@@ -186,7 +188,7 @@ class Evidence(_Record):
 
     schema_: str = SCHEMA
     data_hash: str
-    wheels: Wheels
+    wheels: WheelLayout
     runs: list[RunEvidence]
     quarters: Quarters
     slip: WheelDots | None = None
@@ -195,14 +197,14 @@ class Evidence(_Record):
     notes: list[str] = []
 
 
-def write_evidence(found: Evidence, out: Path) -> Path:
+def write_evidence(found: FitEvidence, out: Path) -> Path:
     """Write evidence.json to a folder and return its path."""
     path = out / EVIDENCE
     write_bytes(path, found.model_dump_json().encode())
     return path
 
 
-def read_evidence(path: Path) -> Evidence:
+def read_evidence(path: Path) -> FitEvidence:
     """Return the content of evidence.json.
 
     Raises:
@@ -210,7 +212,7 @@ def read_evidence(path: Path) -> Evidence:
     """
     expected = "expected the evidence that `slipid identify` writes"
     try:
-        found = Evidence.model_validate_json(path.read_bytes())
+        found = FitEvidence.model_validate_json(path.read_bytes())
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; {expected}") from error
     except ValidationError as error:

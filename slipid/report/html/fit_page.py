@@ -10,11 +10,11 @@ from slipid.data.runs import Runs
 from slipid.infer.fit_file import FIT, load
 from slipid.infer.result import Fit
 from slipid.report.html.blocks import badge
-from slipid.report.html.evidence import EVIDENCE, Evidence, write_evidence
+from slipid.report.html.evidence import EVIDENCE, FitEvidence, write_evidence
 from slipid.report.html.gather import Predictions, evidence_of_fit, evidence_of_predictions
-from slipid.report.html.page import REPORT, Page, write_page
+from slipid.report.html.page import REPORT, WebPage, write_page
 from slipid.report.html.results import Results, read_results
-from slipid.report.html.sections import data, outlook, predictions, summary, wheels
+from slipid.report.html.sections import data, others, outlook, predictions, summary, wheels
 from slipid.support.errors import DataError
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
@@ -34,17 +34,18 @@ SECTIONS = (
     data.posterior,
     outlook.trial,
     outlook.design,
+    others.others,
     outlook.provenance,
 )
 """Functions that return the sections, or None where the results have nothing for them."""
 
 
-def fit_page(found: Results) -> Page:
+def fit_page(found: Results) -> WebPage:
     """Return the page of the results in a folder."""
     name = found.run["config"]["name"].removesuffix(".toml")
     word = found.trust.get("verdict")
     sections = [section for of in SECTIONS if (section := of(found)) is not None]
-    return Page(
+    return WebPage(
         title=f"{name}: what its logs tell",
         badge=None if word is None else badge(word),
         lead=_lead(found),
@@ -87,7 +88,7 @@ def write_calibration_report(
     return _written(evidence_of_predictions(models, task.data_hash), out, report)
 
 
-def _written(evidence: Evidence, out: Path, report: Reporter) -> tuple[str, ...]:
+def _written(evidence: FitEvidence, out: Path, report: Reporter) -> tuple[str, ...]:
     write_evidence(evidence, out)
     report.stage("writing the page")
     try:

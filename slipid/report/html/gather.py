@@ -11,6 +11,7 @@ from scipy.special import fdtri
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, incomplete_poses
 from slipid.fitting.calibration.result import Calibration
+from slipid.fitting.noise import travelled
 from slipid.fitting.shared_effects import AXES
 from slipid.fitting.variances import DEGREES
 from slipid.infer.measured_windows import MeasuredWindows, driving_torque, measured_windows
@@ -34,6 +35,8 @@ QUARTERS = 4
 """Number of parts of a run whose errors are shown."""
 TURNS_ON_SPOT = 0.3
 """Displacement over path length of a quarter below which it has no direction of travel [1]."""
+RESTING_M_S = 0.005
+"""Speed of the fastest rim below which a robot rests [m/s]."""
 LEAST_SHARE = 0.3
 """Smallest speed of a drawn wheel, as a share of that of the fastest wheel: the slip of slower
 wheels is too uncertain."""
@@ -73,7 +76,7 @@ class Predictions:
         return self.selected.get(floor, usual)
 
 
-def evidence_of_fit(fit: Fit, data: Runs) -> ev.Evidence:
+def evidence_of_fit(fit: Fit, data: Runs) -> ev.FitEvidence:
     """Return the evidence of a fit.
 
     Args:
@@ -94,7 +97,7 @@ def evidence_of_fit(fit: Fit, data: Runs) -> ev.Evidence:
 
 def evidence_of_predictions(
     models: Predictions, data_hash: str, notes: Sequence[str] = ()
-) -> ev.Evidence:
+) -> ev.FitEvidence:
     """Return the evidence of predicted runs, without that of a force balance."""
     data, notes = models.data, list(notes)
     reason = next(filter(None, (incomplete_poses(data, k) for k in range(len(data)))), None)
@@ -103,7 +106,7 @@ def evidence_of_predictions(
         runs = _paths(models)
     else:
         notes.append(f"no paths: {reason}")
-    return ev.Evidence(
+    return ev.FitEvidence(
         data_hash=data_hash,
         wheels=_wheels(models.shape),
         runs=runs,
@@ -112,9 +115,9 @@ def evidence_of_predictions(
     )
 
 
-def _wheels(shape: Geometry) -> ev.Wheels:
+def _wheels(shape: Geometry) -> ev.WheelLayout:
     place = np.asarray(shape.place) * float(shape.base_radius)
-    return ev.Wheels(
+    return ev.WheelLayout(
         place_m=[(float(x), float(y)) for x, y in place],
         angle_deg=np.degrees(shape.drive_angle).tolist(),
         drive=list(shape.drive_of or range(shape.wheels)),
@@ -197,8 +200,14 @@ def _kinematic_regions(
         for floor, stds in of_floor.items():
             names = (f"{kind}.{floor}.{axis}" for axis in AXES)
             variance |= {name: std**2 for name, std in zip(names, stds, strict=True)}
-    none = np.zeros((len(w), 3, 3)), np.zeros((len(w), 2, 2))
-    return [replay.path_covariance(seen, w, tracks, variance, *none, edge) for edge in at.tolist()]
+    p, none = tracks.predicted, (np.zeros((len(w), 3, 3)), np.zeros((len(w), 2, 2)))
+    step = np.diff(p, axis=1)
+    step[..., :2] = turned(-p[:, :-1, 2], step[..., :2])
+    motion = travelled(step, float(seen.geometry.base_radius))
+    return [
+        replay.path_covariance(seen, w, tracks, variance, *none, edge, motion)
+        for edge in at.tolist()
+    ]
 
 
 def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
@@ -215,6 +224,7 @@ def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
         heading_deg=round(float(heading), 1) if np.isfinite(heading) else None,
         speed=round(float(speed), 3) if np.isfinite(speed) else None,
         seconds=round(float(time[-1]), 2),
+        rest_s=round(_rest(data, k, float(models.shape.wheel_radius)), 2),
         path_m=round(float(np.linalg.norm(np.diff(measured, axis=0), axis=1).sum()), 4),
         time_s=np.round(time[kept], 2).tolist(),
         measured=_track(done.measured[n, kept]),
@@ -224,12 +234,20 @@ def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
     )
 
 
+def _rest(data: Runs, k: int, radius: float) -> float:
+    """Return the time in a run in which no wheel turns [s]."""
+    rows = data.rows(k)
+    dt = np.diff(data.time[rows])
+    speed = radius * np.abs(np.diff(data.wheel_angle[rows], axis=0)).max(axis=1)
+    return float(dt[speed < RESTING_M_S * dt].sum())
+
+
 def _track(pose: Float[np.ndarray, "edge 3"]) -> ev.Track:
     x, y, yaw = np.round(1000 * pose).astype(int).T.tolist()
     return ev.Track(x_mm=x, y_mm=y, yaw_mrad=yaw)
 
 
-def _region(done: _Replay, n: int) -> ev.Region:
+def _region(done: _Replay, n: int) -> ev.PointRegions:
     """Return the 90 % regions of the n-th run of a replay."""
     factor = np.sqrt(2 * fdtri(2, DEGREES, 0.9))
     edges, axes, angles = [], [], []
@@ -239,7 +257,7 @@ def _region(done: _Replay, n: int) -> ev.Region:
         axes.append(1000 * factor * np.sqrt(np.maximum(square, 0.0)))
         angles.append(round(1000 * float(np.arctan2(*direction[::-1, 1]))))
     minor, major = np.round(axes, 1).T.tolist()
-    return ev.Region(edge=edges, major_mm=major, minor_mm=minor, angle_mrad=angles)
+    return ev.PointRegions(edge=edges, major_mm=major, minor_mm=minor, angle_mrad=angles)
 
 
 def _quarters(runs: Sequence[ev.RunEvidence], data: Runs) -> ev.Quarters:
@@ -264,7 +282,7 @@ def _quarters(runs: Sequence[ev.RunEvidence], data: Runs) -> ev.Quarters:
                 "seconds": round(seconds, 2),
                 "speed": round(float(path) / seconds, 3),
                 "turn_deg_s": round(float(np.degrees(moved[2])) / seconds, 2),
-                "heading_deg": round(float(np.degrees(np.arctan2(*ahead[::-1]))) % 360, 1)
+                "heading_deg": round(float(np.degrees(np.arctan2(*ahead[::-1]))), 1) % 360
                 if moves
                 else None,
                 "along_mm_s": round(1000 * float(off[:2] @ ahead), 2),

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from slipid.report.html.blocks import Badge, Figure, Player, Section
+from slipid.report.html.blocks import Badge, FigureBlock, PageSection, Player
 from slipid.support.content import Content
 from slipid.support.extras import MissingExtra, require
 from slipid.support.files import write_bytes
@@ -22,7 +22,7 @@ _HERE = Path(__file__).parent / "assets"
 
 
 @dataclass(frozen=True)
-class Page:
+class WebPage:
     """Content of a page.
 
     Attributes:
@@ -35,10 +35,10 @@ class Page:
     title: str
     badge: Badge | None
     lead: str
-    sections: Sequence[Section]
+    sections: Sequence[PageSection]
 
 
-def write_page(page: Page, path: Path) -> Path:
+def write_page(page: WebPage, path: Path) -> Path:
     """Write a page and return its path.
 
     Raises:
@@ -49,16 +49,16 @@ def write_page(page: Page, path: Path) -> Path:
     return path
 
 
-def try_page(page: Page, out: Path, report: Reporter) -> tuple[str, ...]:
-    """Write report.html to a folder and return its name, or nothing if a library is missing."""
+def try_page(page: WebPage, path: Path, report: Reporter) -> tuple[str, ...]:
+    """Write a page and return the name of its file, or nothing if a library is missing."""
     try:
-        return (write_page(page, out / REPORT).name,)
+        return (write_page(page, path).name,)
     except MissingExtra as error:  # the results are already written
         report.line(str(error))
         return ()
 
 
-def rendered(page: Page) -> str:
+def rendered(page: WebPage) -> str:
     """Return the HTML of a page."""
     _require("jinja2")
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -93,11 +93,11 @@ def _require(module: str) -> None:
     require(module, "report", f"the page {REPORT}")
 
 
-def _content(sections: Iterable[Section]) -> Content:
+def _content(sections: Iterable[PageSection]) -> Content:
     """Return the content of the figures and players, from which the page's script draws them."""
     blocks = [block for section in sections for block in section.blocks]
     return {
-        "figures": {b.name: b.drawn for b in blocks if isinstance(b, Figure)},
+        "figures": {b.name: b.drawn for b in blocks if isinstance(b, FigureBlock)},
         "players": [{"runs": b.runs, "models": b.models} for b in blocks if isinstance(b, Player)],
     }
 

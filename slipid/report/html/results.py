@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from slipid.infer.fit_file import FIT, IDENTIFIED
-from slipid.report.html.evidence import EVIDENCE, Evidence, read_evidence
+from slipid.report.html.evidence import EVIDENCE, FitEvidence, read_evidence
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json
+from slipid.support.toml_file import mapping_of, text_of
 
 RESULT = "a result of `slipid identify`"
 DRAWS = "posterior.nc"
@@ -24,6 +25,7 @@ class Results:
 
     Attributes:
         folder: the result folder.
+        drive: type of the robot's wheels, as in its config.
         identified: content of identified.json.
         run: content of run.json.
         fit: content of fit.json; None for a calibration alone.
@@ -35,10 +37,11 @@ class Results:
     """
 
     folder: Path
+    drive: str
     identified: Content
     run: Content
     fit: Content | None
-    evidence: Evidence | None
+    evidence: FitEvidence | None
     validation: Content | None
     comparison: Content | None
     trial: Content | None
@@ -60,13 +63,13 @@ class Results:
 
     @property
     def calibration(self) -> Content | None:
-        """Section `calibration` of identified.json."""
+        """PageSection `calibration` of identified.json."""
         found: Content | None = self.identified.get("calibration")
         return found
 
     @property
     def trust(self) -> Content:
-        """Section `trust` of identified.json; empty for a fit without calibrated kinematics."""
+        """PageSection `trust` of identified.json; empty for a fit without calibrated kinematics."""
         found: Content = self.identified.get("trust", {})
         return found
 
@@ -102,6 +105,7 @@ def read_results(out: Path) -> Results:
         )
     return Results(
         folder=out,
+        drive=_drive(out / "config.toml"),
         identified=identified,
         run=run,
         fit=_maybe(out / FIT),
@@ -115,6 +119,12 @@ def read_results(out: Path) -> Results:
         exports=tuple(sorted(p.parent.name for p in out.glob("*/SHA256SUMS"))),
         has_robot=(out / "robot.json").exists(),
     )
+
+
+def _drive(config: Path) -> str:
+    """Return the type of wheels in a config; empty if it names none."""
+    robot = mapping_of(config, text_of(config)).get("robot")
+    return str(robot.get("drive", "")) if isinstance(robot, dict) else ""
 
 
 def _content(path: Path, what: str) -> Content:

@@ -6,7 +6,9 @@ import pytest
 from typer.testing import CliRunner
 
 from slipid.cli.main import app
-from slipid.lab.benchmark.report import COLUMNS, LEGEND, benchmark_pictures, page, show_benchmark
+from slipid.lab.benchmark.report import COLUMNS, LEGEND, benchmark_page, show_benchmark
+from slipid.report.html.blocks import FigureBlock
+from slipid.report.html.page import rendered
 from slipid.report.page import Page
 
 
@@ -60,32 +62,38 @@ def test_the_best_row_comes_first_and_absent_rows_have_reasons():
     assert "quann_slip: failed: ValueError: <no> rank" in text(CONTENT)
 
 
-def test_the_page_has_every_table_and_picture_and_escapes_its_texts():
-    pictures = benchmark_pictures(CONTENT)
-    assert list(pictures) == ["carpets"]
-    assert pictures["carpets"].startswith(b"\x89PNG")
-    written = page(CONTENT, pictures)
-    assert written.count("<img") == 1
+def page(content):
+    return rendered(benchmark_page(content))
+
+
+def figures(content):
+    sections = benchmark_page(content).sections
+    return [b for section in sections for b in section.blocks if isinstance(b, FigureBlock)]
+
+
+def test_the_page_has_every_table_and_figure_and_escapes_its_texts():
+    (figure,) = figures(CONTENT)
+    assert "best of 2 rows is slipid, off by 5.0 %" in figure.alt
+    written = page(CONTENT)
     for number, *_ in COLUMNS.values():
         assert number.partition(",")[0].lower() in LEGEND.lower()
     assert "quann_slip: failed: ValueError: &lt;no&gt; rank" in written
-    assert "<tr class='own'><td>slipid</td>" in written
-    assert written.index("<td>slipid</td>") < written.index("<td>encoder</td>")
+    own, other = '<span class="badge good">slipid</span>', '<th scope="row">encoder</th>'
+    assert written.index(own) < written.index(other)
 
 
-def test_a_data_set_in_which_nothing_ran_has_no_picture():
+def test_a_data_set_in_which_nothing_ran_has_no_figure():
     content = copy.deepcopy(CONTENT)
     failed = {"slipid": row(absent="gone", failed=True)}
     content["sets"]["carpets"]["protocols"]["known_floor"] = failed
-    assert benchmark_pictures(content) == {}
-    assert "<img" not in page(content, {})
+    assert figures(content) == []
 
 
 def test_fits_that_did_not_converge_are_reported():
     content = copy.deepcopy(CONTENT)
     content["sets"]["carpets"]["protocols"]["known_floor"]["slipid"]["unconverged"] = 2
     assert "slipid: fits that did not converge: 2" in text(content)
-    assert "slipid: fits that did not converge: 2" in page(content, {})
+    assert "slipid: fits that did not converge: 2" in page(content)
 
 
 def classifier_row(name, absent=""):
@@ -97,7 +105,7 @@ def test_a_failed_classifier_is_reported_above_the_others():
     content = copy.deepcopy(CONTENT)
     rows = [classifier_row("gaussian"), classifier_row("trees", "ValueError: no leaf")]
     content["floors"] = {"husky": {"about": "a Husky", "runs": 9, "chance": 0.3, "rows": rows}}
-    for written in (text(content), page(content, {})):
+    for written in (text(content), page(content)):
         flat = " ".join(written.split())
         assert "failed: trees: ValueError: no leaf" in flat
         assert "70 [60, 80]" in flat
@@ -132,7 +140,6 @@ BROKEN = {
 def test_the_exit_code_is_one_if_anything_failed(broken, tmp_path, monkeypatch):
     content = clean() | (BROKEN[broken] if broken else {})
     monkeypatch.setattr("slipid.lab.benchmark.benchmark.benchmark", lambda *_: content)
-    monkeypatch.setattr("slipid.lab.benchmark.report.benchmark_pictures", lambda _: {})
     requested = ["benchmark", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]
     done = CliRunner().invoke(app, requested)
     assert done.exit_code == (1 if broken else 0), done.output
@@ -155,9 +162,9 @@ def test_the_rectangle_is_ranked_by_closure(where):
 
     rows = {"encoder": controller(200.0, 1.0), "contact": controller(110.0, 0.55)}
     content["rectangle"] = {"plant": "testsite", "summary": rows}
-    written = text(content) if where == "terminal" else page(content, {})
+    written = text(content) if where == "terminal" else page(content)
     assert "rectangle on the virtual test site, 8 starts" in written
     assert written.index("110 [105, 115]") < written.index("200 [195, 205]")
     assert "55 [40, 70]" in written
     content["rectangle"] = {"failed": "no MuJoCo"}
-    assert "failed: no MuJoCo" in (text(content) if where == "terminal" else page(content, {}))
+    assert "failed: no MuJoCo" in (text(content) if where == "terminal" else page(content))

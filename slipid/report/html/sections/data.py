@@ -5,8 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from slipid.report.html import figures as draw
-from slipid.report.html.blocks import Block, Figure, Section, Table, Text, enumerated, number
-from slipid.report.html.evidence import Evidence
+from slipid.report.html.blocks import (
+    Block,
+    FigureBlock,
+    PageSection,
+    TableBlock,
+    TextBlock,
+    Trace,
+    enumerated,
+    number,
+)
+from slipid.report.html.evidence import FitEvidence
 from slipid.report.html.results import Results
 from slipid.report.html.sections.summary import MOST_NOTES, ranked_notes
 from slipid.support.content import Content
@@ -15,26 +24,26 @@ STRONG = 0.9
 """Absolute correlation from which a pair of parameters is named [1]."""
 MOST_PAIRS, MOST_NAMES = 6, 26
 """Largest numbers of named pairs, and of parameters in the figure of correlations."""
-RESTING_M_S, RESTING_DEG_S = 0.005, 1.0
-"""Speed and yaw rate below which the robot rests [m/s, deg/s]."""
 SECTOR_DEG = 30
 """Width of a sector of directions of travel [deg]."""
 
 
-def correlations(found: Results) -> Section | None:
+def correlations(found: Results) -> PageSection | None:
     """Return the section about correlations and flat directions, in words and as a figure."""
     if found.fit is None:
         return None
     blocks: list[Block] = []
     if flat := list(dict.fromkeys(f["formula"] for f in found.fit["flat"])):
         intro = "Changes of the parameters that have no effect, or almost none, on the data:"
-        blocks += [Text([intro]), Text(flat, listed=True)]
+        blocks += [TextBlock([intro]), TextBlock(flat, listed=True)]
     if found.evidence is not None and found.evidence.correlations is not None:
         blocks += _matrix(found.evidence)
-    return Section("correlations", "What the logs cannot tell apart", blocks) if blocks else None
+    return (
+        PageSection("correlations", "What the logs cannot tell apart", blocks) if blocks else None
+    )
 
 
-def _matrix(evidence: Evidence) -> list[Block]:
+def _matrix(evidence: FitEvidence) -> list[Block]:
     """Return the strongest correlations as sentences, and the matrix as a figure."""
     c = evidence.correlations
     assert c is not None
@@ -72,13 +81,13 @@ def _matrix(evidence: Evidence) -> list[Block]:
     more = f" The {len(shown)} most correlated of {len(names)}." if len(shown) < len(names) else ""
     caption = f"Blue: they rise together; orange: one rises while the other falls.{more}"
     alt = f"{title}. Matrix of the correlations of fitted parameters."
-    figure = Figure(
+    figure = FigureBlock(
         "correlation", title, alt, [heat], layout, caption, 160 + 19 * len(shown), minimum=620
     )
     blocks: list[Block] = []
     if told:
-        blocks.append(Text(["Pairs of which the data know a combination better than each:"]))
-        blocks.append(Text(told, listed=True))
+        blocks.append(TextBlock(["Pairs of which the data know a combination better than each:"]))
+        blocks.append(TextBlock(told, listed=True))
     return [*blocks, figure]
 
 
@@ -88,7 +97,7 @@ def _in_words(rho: float) -> str:
     return f"correlation {rho:+.2f}, so that their {known} is known best"
 
 
-def quality(found: Results) -> Section:
+def quality(found: Results) -> PageSection:
     """Return the section about the quality of the data."""
     blocks: list[Block] = []
     evidence = found.evidence
@@ -99,19 +108,19 @@ def quality(found: Results) -> Section:
     skipped = list(found.run["data"].get("skipped", ()))
     if skipped:
         blocks += [
-            Text([f"{len(skipped)} files or runs were set aside:"]),
-            Text(skipped, listed=True),
+            TextBlock([f"{len(skipped)} files or runs were set aside:"]),
+            TextBlock(skipped, listed=True),
         ]
     else:
-        blocks.append(Text(["No file and no run was set aside."]))
+        blocks.append(TextBlock(["No file and no run was set aside."]))
     if more := ranked_notes(found)[MOST_NOTES:]:
-        blocks += [Text(["Further notes:"]), Text(more, listed=True)]
+        blocks += [TextBlock(["Further notes:"]), TextBlock(more, listed=True)]
     if evidence is not None and evidence.notes:
-        blocks.append(Text(evidence.notes, listed=True, kind="note"))
-    return Section("data", "Quality of the data", blocks)
+        blocks.append(TextBlock(evidence.notes, listed=True, kind="note"))
+    return PageSection("data", "Quality of the data", blocks)
 
 
-def _coverage_table(found: Results, evidence: Evidence) -> Table:
+def _coverage_table(found: Results, evidence: FitEvidence) -> TableBlock:
     """Return a table of what was driven on each floor with each load."""
     q, runs = evidence.quarters, evidence.runs
     rows = []
@@ -153,10 +162,10 @@ def _coverage_table(found: Results, evidence: Evidence) -> Table:
         f"What was driven: {len(runs)} runs. Directions are sectors of {SECTOR_DEG} degrees in the "
         "body frame."
     )
-    return Table(caption, head, rows, right=head[2:])
+    return TableBlock(caption, head, rows, right=head[2:])
 
 
-def _coverage(evidence: Evidence) -> Figure:
+def _coverage(evidence: FitEvidence) -> FigureBlock:
     """Return the figure of directions, speeds and turns that were driven."""
     q, runs = evidence.quarters, evidence.runs
     floors = list(dict.fromkeys(run.floor for run in runs))
@@ -211,10 +220,10 @@ def _coverage(evidence: Evidence) -> Figure:
         title = _turns(evidence)
         caption = "A dot for every quarter of a run."
     alt = f"{title}. Dots show how the quarters of the runs were driven."
-    return Figure("coverage", title, alt, data, layout, caption, 400)
+    return FigureBlock("coverage", title, alt, data, layout, caption, 400)
 
 
-def _missing(evidence: Evidence, floors: Sequence[str]) -> str:
+def _missing(evidence: FitEvidence, floors: Sequence[str]) -> str:
     """Return how completely the directions of travel were driven, floor by floor."""
     q, runs = evidence.quarters, evidence.runs
     all_sectors, parts = 360 // SECTOR_DEG, []
@@ -231,7 +240,7 @@ def _missing(evidence: Evidence, floors: Sequence[str]) -> str:
     )
 
 
-def _turns(evidence: Evidence) -> str:
+def _turns(evidence: FitEvidence) -> str:
     """Return a sentence about the turns to both sides."""
     turn = np.array(evidence.quarters.turn_deg_s)
     left, right = int((turn > 2).sum()), int((turn < -2).sum())
@@ -239,7 +248,7 @@ def _turns(evidence: Evidence) -> str:
     return f"{straight} quarters of runs go straight, {left} turn left and {right} turn right"
 
 
-def _clocks(found: Results) -> Text | None:
+def _clocks(found: Results) -> TextBlock | None:
     """Return sentences about lag and noise of the poses."""
     c = found.calibration
     if c is None:
@@ -253,21 +262,21 @@ def _clocks(found: Results) -> Text | None:
     ]
     if not c["settled"]:
         out.append("The calibration had not settled when it ended.")
-    return Text([" ".join(out)])
+    return TextBlock([" ".join(out)])
 
 
 PAIRS = 5
 """Largest number of parameters in the figure of pairs."""
 
 
-def posterior(found: Results) -> Section | None:
+def posterior(found: Results) -> PageSection | None:
     """Return the section about the posterior: convergence, and pairs of parameters."""
     if found.sample is None:
         return None
     s, worst = found.sample, found.sample["worst"]
     state = "converged" if s["converged"] else "NOT converged; do not trust the intervals"
     blocks: list[Block] = [
-        Text(
+        TextBlock(
             [
                 f"The chains have {state}: worst R-hat {worst['r_hat']:.3f}, "
                 f"{worst['effective_draws']:.0f} effective draws of the worst number; "
@@ -279,11 +288,13 @@ def posterior(found: Results) -> Section | None:
     if found.draws:
         blocks.append(_pairs(found, found.draws))
     else:
-        blocks.append(Text(["Pairs need the draws in posterior.nc, and the extra `posterior`."]))
-    return Section("posterior", "Posterior", blocks)
+        blocks.append(
+            TextBlock(["Pairs need the draws in posterior.nc, and the extra `posterior`."])
+        )
+    return PageSection("posterior", "Posterior", blocks)
 
 
-def _pairs(found: Results, draws: dict[str, np.ndarray]) -> Figure:
+def _pairs(found: Results, draws: dict[str, np.ndarray]) -> FigureBlock:
     """Return the scatter plots of pairs of the most correlated scalar parameters."""
     free = {
         p: x
@@ -307,10 +318,10 @@ def _pairs(found: Results, draws: dict[str, np.ndarray]) -> Figure:
     alt = f"{title}. Scatter plots of pairs of the {len(chosen)} most correlated parameters."
     caption = f"Draws of the {len(chosen)} most correlated parameters; a line means a trade-off."
     height = 80 + 120 * (len(chosen) - 1)
-    return Figure("pairs", title, alt, data, layout, caption, height, minimum=620)
+    return FigureBlock("pairs", title, alt, data, layout, caption, height, minimum=620)
 
 
-def _pair_panels(draws: dict[str, np.ndarray]) -> tuple[list[draw.Trace], Content]:
+def _pair_panels(draws: dict[str, np.ndarray]) -> tuple[list[Trace], Content]:
     """Return series and layout of a triangle of scatter plots, a panel for each pair."""
     names, data = list(draws), []
     count = len(names) - 1

@@ -1,11 +1,18 @@
 """Sections about what follows a fit: trial, further runs, comparison with others, provenance."""
 
 from slipid.report.html import figures as draw
-from slipid.report.html.blocks import Block, Code, Figure, Section, Table, Text
+from slipid.report.html.blocks import (
+    Block,
+    CopyLines,
+    FigureBlock,
+    PageSection,
+    TableBlock,
+    TextBlock,
+)
 from slipid.report.html.results import Results
 
 
-def trial(found: Results) -> Section | None:
+def trial(found: Results) -> PageSection | None:
     """Return the section about the trial of controllers in simulation."""
     t = found.trial
     if t is None:
@@ -39,7 +46,7 @@ def trial(found: Results) -> Section | None:
     caption = (
         f"Medians of {runs} starts, with 90 % intervals; {t['path']} at {t['speed_m_s']:g} m/s."
     )
-    figure = Figure("trial_errors", title, title, data, layout, caption, 130 + 34 * len(names))
+    figure = FigureBlock("trial_errors", title, title, data, layout, caption, 130 + 34 * len(names))
     rows = [
         (
             t["controllers"].get(n, n),
@@ -53,12 +60,12 @@ def trial(found: Results) -> Section | None:
     head = ("controller", "closure [mm]", "cross-track [mm]", "heading [deg]", "finished [%]")
     plant = "the fitted model itself" if t["plant"] == "twin" else "a robot in a physics engine"
     about = f"Errors of the controllers; the simulated robot is {plant}."
-    return Section(
-        "trial", "Trial of controllers", [figure, Table(about, head, rows, right=head[1:])]
+    return PageSection(
+        "trial", "Trial of controllers", [figure, TableBlock(about, head, rows, right=head[1:])]
     )
 
 
-def design(found: Results) -> Section | None:
+def design(found: Results) -> PageSection | None:
     """Return the section with the runs to drive next."""
     d = found.design
     if d is None or not d["runs"]:
@@ -77,13 +84,13 @@ def design(found: Results) -> Section | None:
     ]
     head = ("run", "floor", "load", "direction", "speed [m/s]", "turn [rad/s]", "seconds")
     about = "Runs that narrow the intervals most, in the order in which to drive them."
-    blocks: list[Block] = [Table(about, head, rows, right=head[4:])]
+    blocks: list[Block] = [TableBlock(about, head, rows, right=head[4:])]
     if d["messages"]:
-        blocks.append(Text(d["messages"], listed=True, kind="note"))
-    return Section("design", "What to drive next", blocks)
+        blocks.append(TextBlock(d["messages"], listed=True, kind="note"))
+    return PageSection("design", "What to drive next", blocks)
 
 
-def provenance(found: Results) -> Section:
+def provenance(found: Results) -> PageSection:
     """Return the section about the origin of the results, and the commands that follow."""
     run, out = found.run, found.folder
     config, data = run["config"], run["data"]
@@ -98,21 +105,21 @@ def provenance(found: Results) -> Section:
     if found.fit is not None:
         ended = "converged" if found.fit["converged"] else "did NOT converge"
         rows.append(("optimisation", f"{ended}: {found.fit['reason']}"))
-    blocks: list[Block] = [Table("Where these results come from.", ("what", "value"), rows)]
+    blocks: list[Block] = [TableBlock("Where these results come from.", ("what", "value"), rows)]
     kind = "" if found.fit is not None else " --only calibration"
     blocks.append(
-        Code(
+        CopyLines(
             "To repeat it",
             f"slipid identify {out.name}/config.toml --data LOGS --out {out.name}{kind}",
         )
     )
     lines = [f"{sentence:42}# {why}" for sentence, why in _next(found)]
-    blocks.append(Code("What you can do next", "\n".join(lines)))
+    blocks.append(CopyLines("What you can do next", "\n".join(lines)))
     files = ["robot.json"] if found.has_robot else []
     files += [f"{name}/" for name in found.exports]
     if files:
-        blocks.append(Text([f"Files to deploy: {', '.join(files)}."]))
-    return Section("provenance", "Provenance and next steps", blocks)
+        blocks.append(TextBlock([f"Files to deploy: {', '.join(files)}."]))
+    return PageSection("provenance", "Provenance and next steps", blocks)
 
 
 def _next(found: Results) -> list[tuple[str, str]]:

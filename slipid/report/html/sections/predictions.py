@@ -8,11 +8,11 @@ from slipid.report.html import figures as draw
 from slipid.report.html.blocks import (
     Block,
     Cell,
-    Figure,
+    FigureBlock,
+    PageSection,
     Player,
-    Section,
-    Table,
-    Text,
+    TableBlock,
+    TextBlock,
     badge,
     colour,
     enumerated,
@@ -29,7 +29,7 @@ HALF90 = 1.645
 """Half width of a 90 % interval of a normal distribution [std]."""
 
 
-def held_out(found: Results) -> Section | None:
+def held_out(found: Results) -> PageSection | None:
     """Return the section about errors on held-out runs, model by model."""
     blocks: list[Block] = []
     if errors := found.trust.get("held_out_error_over_path"):
@@ -38,7 +38,7 @@ def held_out(found: Results) -> Section | None:
         blocks += _validation(found.validation)
     if found.comparison is not None:
         blocks += _ranking(found.comparison)
-    return Section("errors", "How well it predicts", blocks) if blocks else None
+    return PageSection("errors", "How well it predicts", blocks) if blocks else None
 
 
 def _selection(found: Results, errors: Content) -> list[Block]:
@@ -74,12 +74,12 @@ def _selection(found: Results, errors: Content) -> list[Block]:
             row = (floor, label(model), f"{100 * error:.2f}", difference, chosen)
             rows.append(row)
     title = "; ".join(_compared(f, errors[f], found.selected[f]) for f in floors[:3])
-    layout = {
+    layout: Content = {
         "xaxis": draw.axis("error on held-out runs [% of the path]", rangemode="tozero"),
         "yaxis": {"automargin": True, "autorange": "reversed"},
         "showlegend": True,
     }
-    if _wide([100 * e for each in errors.values() for e in each.values()]):
+    if is_wide([100 * e for each in errors.values() for e in each.values()]):
         layout["xaxis"] |= {"type": "log", "rangemode": "normal"}
     alt = f"{title}. Dots show the error of every model on every floor; the table has the numbers."
     caption = (
@@ -90,12 +90,12 @@ def _selection(found: Results, errors: Content) -> list[Block]:
     head = ("floor", "model", "error [% of the path]", "minus the best", "")
     about = "Errors of the models on held-out runs, with 90 % intervals of the difference."
     return [
-        Figure("held_out", title, alt, data, layout, caption, height),
-        Table(about, head, rows, right=head[2:4], folded=True),
+        FigureBlock("held_out", title, alt, data, layout, caption, height),
+        TableBlock(about, head, rows, right=head[2:4], folded=True),
     ]
 
 
-def _wide(values: Sequence[float]) -> bool:
+def is_wide(values: Sequence[float]) -> bool:
     """Return whether values need a logarithmic axis."""
     return min(values) > 0 and max(values) > 15 * min(values)
 
@@ -145,18 +145,18 @@ def _validation(content: Content) -> list[Block]:
     ]
     title = f"Other runs: the {label(chosen)} ends off by {enumerated(parts)} of the path"
     every = [s["endpoint_error_over_path_mean"] for f in summary.values() for s in f.values()]
-    layout = {
+    layout: Content = {
         "xaxis": draw.axis("mean end-point error [% of the path]"),
         "yaxis": {"automargin": True, "autorange": "reversed"},
         "showlegend": True,
     }
-    layout["xaxis"] |= {"type": "log"} if _wide(every) else {"rangemode": "tozero"}
+    layout["xaxis"] |= {"type": "log"} if is_wide(every) else {"rangemode": "tozero"}
     alt = f"{title}. Dots show the error of every model by floor; the table has the numbers."
     head = ("floor", "model", "end error [% of path]", "heading [deg]", "in 90 % region", "runs")
     about = "Errors of open-loop predictions of the runs of `slipid validate`, and coverage [%]."
     return [
-        Figure("validation", title, alt, data, layout, "", 140 + 55 * len(floors)),
-        Table(about, head, rows, right=head[2:], folded=True),
+        FigureBlock("validation", title, alt, data, layout, "", 140 + 55 * len(floors)),
+        TableBlock(about, head, rows, right=head[2:], folded=True),
     ]
 
 
@@ -186,7 +186,7 @@ def _ranking(content: Content) -> list[Block]:
             name = f"ranking_{question}_{floor}"
             title = f"{question} held out: {one['sentence']}"
             alt = f"{title}. Dots show how far every model is behind the best."
-            out.append(Figure(name, title, alt, data, layout, "", 130 + 22 * len(order)))
+            out.append(FigureBlock(name, title, alt, data, layout, "", 130 + 22 * len(order)))
             best = order[::-1][:SHOWN_RANKS]
             rows = [
                 (
@@ -198,16 +198,16 @@ def _ranking(content: Content) -> list[Block]:
             ]
             head = ("model", "log density [nats per run]", "end error [% of chord]")
             about = f"The {len(best)} best of {len(order)} models on {floor}."
-            out.append(Table(about, head, rows, right=head[1:], folded=True))
+            out.append(TableBlock(about, head, rows, right=head[1:], folded=True))
     return out
 
 
-def paths(found: Results) -> Section | None:
+def paths(found: Results) -> PageSection | None:
     """Return the section in which the path of any run can be played."""
     evidence = found.evidence
     if evidence is None or not evidence.runs:
         notes = [] if evidence is None else evidence.notes
-        return Section("paths", "Paths", [Text(notes, kind="note")]) if notes else None
+        return PageSection("paths", "Paths", [TextBlock(notes, kind="note")]) if notes else None
     names = list(dict.fromkeys(m for run in evidence.runs for m in run.models))
     runs = [_played(run) for run in evidence.runs]
     about = (
@@ -219,8 +219,8 @@ def paths(found: Results) -> Section | None:
         "Measured path of a run, and its predictions by the config's lengths, by calibrated "
         "kinematics and by the selected model, on the floor seen from above."
     )
-    blocks: list[Block] = [Text([about]), Player(runs, {m: label(m) for m in names}, alt)]
-    return Section("paths", "Play a run", blocks)
+    blocks: list[Block] = [TextBlock([about]), Player(runs, {m: label(m) for m in names}, alt)]
+    return PageSection("paths", "Play a run", blocks)
 
 
 def _played(run: RunEvidence) -> Content:
@@ -268,7 +268,7 @@ CONDITIONS: Mapping[str, str] = {
 """Title of the axis of each condition of a quarter, keyed by its column."""
 
 
-def residuals(found: Results) -> Section | None:
+def residuals(found: Results) -> PageSection | None:
     """Return the section about errors of the selected model in quarters of the runs."""
     evidence = found.evidence
     if evidence is None or not evidence.quarters.run:
@@ -305,10 +305,10 @@ def residuals(found: Results) -> Section | None:
         "Predicted less measured motion of the selected model in quarters of the runs. A cloud "
         "around zero without a trend means that nothing systematic is left."
     )
-    figure = Figure(
+    figure = FigureBlock(
         "residuals", title, alt, data, layout, caption, 60 + 260 * rows, choices, minimum=520
     )
-    return Section("residuals", "What the model leaves unexplained", [figure])
+    return PageSection("residuals", "What the model leaves unexplained", [figure])
 
 
 def _varies(column: Sequence[float | None]) -> bool:

@@ -7,11 +7,11 @@ from slipid.report.html.blocks import (
     Badge,
     Block,
     Cell,
-    Code,
-    Figure,
-    Section,
-    Table,
-    Text,
+    CopyLines,
+    FigureBlock,
+    PageSection,
+    TableBlock,
+    TextBlock,
     badge,
     enumerated,
     interval,
@@ -32,23 +32,25 @@ USE = {
 """What a result may be used for, keyed by the level of trust."""
 
 
-def verdict(found: Results) -> Section:
+def verdict(found: Results) -> PageSection:
     """Return the section with the verdict in one line, and what the result may be used for."""
     word = found.trust.get("verdict")
     blocks: list[Block] = []
     if word is None:
         converged = found.fit is not None and found.fit["converged"]
         word = "converged" if converged else "not converged"
-        blocks.append(Text([f"The fit has {word}. It has no verdict of trust."]))
+        blocks.append(TextBlock([f"The fit has {word}. It has no verdict of trust."]))
     else:
-        blocks.append(Text([f"{word[0].upper()}{word[1:]}. {USE[word]}"], kind=badge(word).kind))
+        blocks.append(
+            TextBlock([f"{word[0].upper()}{word[1:]}. {USE[word]}"], kind=badge(word).kind)
+        )
         if reasons := found.trust["reasons"]:
-            blocks.append(Text(reasons, listed=True, kind="warning"))
+            blocks.append(TextBlock(reasons, listed=True, kind="warning"))
         blocks.append(_floors(found))
     notes = ranked_notes(found)
     if notes:
-        blocks.append(Text(notes[:MOST_NOTES], listed=True, kind="note"))
-    return Section("verdict", "Verdict", blocks)
+        blocks.append(TextBlock(notes[:MOST_NOTES], listed=True, kind="note"))
+    return PageSection("verdict", "Verdict", blocks)
 
 
 def ranked_notes(found: Results) -> list[str]:
@@ -60,7 +62,7 @@ def ranked_notes(found: Results) -> list[str]:
     return [*found.trust.get("notes", ()), *others]
 
 
-def _floors(found: Results) -> Table:
+def _floors(found: Results) -> TableBlock:
     """Return a table of the floors with the selected model and its error."""
     rows: list[Sequence[Cell]] = []
     for floor, errors in found.trust["held_out_error_over_path"].items():
@@ -80,7 +82,7 @@ def _floors(found: Results) -> Table:
         "held-out runs, as a share of the path length."
     )
     head = ("floor", "selected model", "error", "with the config's lengths", "runs")
-    return Table(caption, head, rows, right=("error", "with the config's lengths", "runs"))
+    return TableBlock(caption, head, rows, right=("error", "with the config's lengths", "runs"))
 
 
 def percent(value: float) -> str:
@@ -88,22 +90,22 @@ def percent(value: float) -> str:
     return f"{100 * value:.2g} %" if value < 0.1 else f"{100 * value:.0f} %"
 
 
-def numbers(found: Results) -> Section | None:
+def numbers(found: Results) -> PageSection | None:
     """Return the section with the numbers to type into a robot."""
     lines = [*_calibrated_lines(found), *_motor_lines(found)]
     if not lines:
         return None
     name = found.run["config"]["name"]
     text = "\n".join([f"# {name}, by slipid {_version(found)}; 90 % intervals", *lines])
-    about = Text(
+    about = TextBlock(
         [
             "Lengths are effective ones: with them, odometry without a slip model is right on "
             "average on that floor. Multipliers are ratios to the lengths of the config, as "
             "drive controllers of ROS take them."
         ]
     )
-    blocks: list[Block] = [about, Code("Numbers to type in", text)]
-    return Section("numbers", "Type these numbers into your robot", blocks)
+    blocks: list[Block] = [about, CopyLines("Numbers to type in", text)]
+    return PageSection("numbers", "Type these numbers into your robot", blocks)
 
 
 def _version(found: Results) -> str:
@@ -189,7 +191,7 @@ def _line(name: str, value: Content) -> str:
     return f"{text}  # {'; '.join(comments)}" if comments else text
 
 
-def values(found: Results) -> Section | None:
+def values(found: Results) -> PageSection | None:
     """Return the section with all values, intervals and priors, and what to do about weak ones."""
     blocks: list[Block] = []
     if (calibration := found.calibration) is not None:
@@ -201,15 +203,15 @@ def values(found: Results) -> Section | None:
             f"Parameters of the force balance: {_counts(found)}. The prior is what was known "
             "before the logs, as mean and standard deviation."
         )
-        blocks.append(Table(caption, head, rows, right=("value",)))
+        blocks.append(TableBlock(caption, head, rows, right=("value",)))
         if (figure := _narrowing(found)) is not None:
             blocks.append(figure)
         blocks += _remedies(found)
         fixed = list(_rows(found, fixed=True))
         if fixed:
             caption = "Values that were given or have the default, and were not fitted."
-            blocks.append(Table(caption, head, fixed, right=("value",), folded=True))
-    return Section("values", "Values and intervals", blocks) if blocks else None
+            blocks.append(TableBlock(caption, head, fixed, right=("value",), folded=True))
+    return PageSection("values", "Values and intervals", blocks) if blocks else None
 
 
 def _counts(found: Results) -> str:
@@ -219,7 +221,7 @@ def _counts(found: Results) -> str:
     return enumerated([f"{words.count(w)} {w.replace('_', ' ')}" for w in names if w in words])
 
 
-def calibration_table(c: Content) -> Table:
+def calibration_table(c: Content) -> TableBlock:
     """Return the table of calibrated numbers."""
     rows: list[Sequence[Cell]] = []
 
@@ -253,7 +255,7 @@ def calibration_table(c: Content) -> Table:
             row(text, c[name])
     head = ("calibrated number", "value", "unit", "90 % interval", "verdict")
     caption = "Calibrated kinematics and pose sensor: what odometry without a slip model needs."
-    return Table(caption, head, rows, right=("value",))
+    return TableBlock(caption, head, rows, right=("value",))
 
 
 def _rows(found: Results, fixed: bool) -> Iterator[Sequence[Cell]]:
@@ -281,7 +283,7 @@ def _rows(found: Results, fixed: bool) -> Iterator[Sequence[Cell]]:
             )
 
 
-def _narrowing(found: Results) -> Figure | None:
+def _narrowing(found: Results) -> FigureBlock | None:
     """Return the figure of how much the logs narrowed each number."""
     shown = {
         p: e["ratio"]
@@ -342,7 +344,7 @@ def _narrowing(found: Results) -> Figure | None:
     }
     title = f"The logs determine {good} of {len(order)} parameters"
     alt = f"{title}. Dots show the width of each parameter's interval over that of its prior."
-    return Figure(
+    return FigureBlock(
         "narrowing",
         title,
         alt,
@@ -374,6 +376,6 @@ def _remedies(found: Results) -> list[Block]:
     if not out:
         return []
     return [
-        Text(["What to do about numbers that are weak or not identified:"]),
-        Text(out, listed=True),
+        TextBlock(["What to do about numbers that are weak or not identified:"]),
+        TextBlock(out, listed=True),
     ]

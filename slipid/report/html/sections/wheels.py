@@ -4,13 +4,13 @@ import numpy as np
 
 from slipid.infer.slip_curves import slip_sentence
 from slipid.report.html import figures as draw
-from slipid.report.html.blocks import Block, Drawing, Figure, Section, label
-from slipid.report.html.evidence import Evidence, Wheels
+from slipid.report.html.blocks import Block, DrawingBlock, FigureBlock, PageSection, label
+from slipid.report.html.evidence import FitEvidence, WheelLayout
 from slipid.report.html.results import Results
 from slipid.support.content import Content
 
 
-def currents(found: Results) -> Section | None:
+def currents(found: Results) -> PageSection | None:
     """Return the section about measured, initial and fitted currents."""
     evidence = found.evidence
     if evidence is None or evidence.currents is None or not evidence.currents.run:
@@ -49,14 +49,14 @@ def currents(found: Results) -> Section | None:
     )
     alt = f"{title} (root mean square). Dots of predicted over measured currents."
     caption = "Means over segments of the runs; before the fit, every number had its start value."
-    return Section(
+    return PageSection(
         "currents",
         "Before and after the fit",
-        [Figure("currents", title, alt, data, layout, caption, 420)],
+        [FigureBlock("currents", title, alt, data, layout, caption, 420)],
     )
 
 
-def loads(found: Results) -> Section | None:
+def loads(found: Results) -> PageSection | None:
     """Return the section with the loads drawn on the robot."""
     evidence = found.evidence
     if evidence is None:
@@ -67,10 +67,10 @@ def loads(found: Results) -> Section | None:
         if name == path or e["interval90"] is None:
             continue
         blocks.append(_robot(evidence.wheels, name, e))
-    return Section("loads", "Weight on the wheels", blocks) if blocks else None
+    return PageSection("loads", "Weight on the wheels", blocks) if blocks else None
 
 
-def _robot(wheels: Wheels, name: str, e: Content) -> Drawing:
+def _robot(wheels: WheelLayout, name: str, e: Content) -> DrawingBlock:
     """Return the robot from above, with the share of the weight on each wheel; ahead is up."""
     place = np.array(wheels.place_m)
     reach = max(float(np.abs(place).max()), 1e-3)
@@ -116,10 +116,10 @@ def _robot(wheels: Wheels, name: str, e: Content) -> Drawing:
         f"wheel {k + 1} carries {100 * s:.1f} %" for k, s in enumerate(share)
     )
     caption = "Share of the weight on each wheel, with its 90 % interval; the cross is the centre."
-    return Drawing(title, alt, "".join(parts), caption)
+    return DrawingBlock(title, alt, "".join(parts), caption)
 
 
-def slip(found: Results) -> Section | None:
+def slip(found: Results) -> PageSection | None:
     """Return the section about slip over torque, floor by floor."""
     evidence, curves = found.evidence, found.identified["curves"]
     if not curves:
@@ -146,7 +146,7 @@ def slip(found: Results) -> Section | None:
         "torque by the measured current, scaled to an even load. The curve is that of a wheel "
         "that rolls straight ahead."
     )
-    figure = Figure(
+    figure = FigureBlock(
         "slip",
         title,
         alt,
@@ -156,7 +156,7 @@ def slip(found: Results) -> Section | None:
         70 + 290 * rows,
         minimum=420,
     )
-    return Section("slip", "Slip of the wheels", [figure])
+    return PageSection("slip", "Slip of the wheels", [figure])
 
 
 def _panel_title(found: Results, floor: str) -> str:
@@ -164,7 +164,7 @@ def _panel_title(found: Results, floor: str) -> str:
     return floor if chosen == "contact" else f"{floor} (not selected: {label(chosen)} is)"
 
 
-def _cloud(evidence: Evidence, floor: str, first: bool) -> Content:
+def _cloud(evidence: FitEvidence, floor: str, first: bool) -> Content:
     """Return the dots of a floor."""
     s, runs = evidence.slip, evidence.runs
     assert s is not None

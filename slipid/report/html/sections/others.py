@@ -1,0 +1,121 @@
+"""Section that shows a robot beside the reference robots of a similar drive."""
+
+from collections.abc import Iterator, Sequence
+
+from slipid.app.reference_robots import ReferenceBand, reference_bands
+from slipid.report.html import figures as draw
+from slipid.report.html.blocks import (
+    Block,
+    Cell,
+    FigureBlock,
+    PageSection,
+    TableBlock,
+    TextBlock,
+    colour,
+    interval,
+    label,
+    number,
+)
+from slipid.report.html.results import Results
+from slipid.report.html.sections.predictions import is_wide
+
+ERRORS = ("nominal", "calibrated", "selected")
+"""Models whose errors are compared."""
+OTHERS = {
+    "calibration.multipliers.*.wheel_radius": "wheel radius over nominal",
+    "calibration.multipliers.*.track": "track or base over nominal",
+    "surface.*.friction": "friction coefficient",
+    "surface.*.creep": "creep",
+}
+"""Text of each number that is compared, keyed by its path."""
+
+
+def others(found: Results) -> PageSection | None:
+    """Return the section about how this robot compares with reference robots."""
+    errors = found.trust.get("held_out_error_over_path")
+    bands = {
+        m: reference_bands(found.drive, f"trust.held_out_error_over_path.*.{m}") for m in ERRORS
+    }
+    if not errors or not bands["selected"]:
+        return None
+    blocks: list[Block] = [
+        TextBlock(
+            [
+                "Robots with a similar drive, identified from public logs; `slipid robots` lists "
+                "them. Other floors slip differently: a larger error is no fault by itself."
+            ]
+        ),
+        _errors(found, bands),
+        _numbers(found),
+    ]
+    return PageSection("others", "Is this good?", blocks)
+
+
+def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> FigureBlock:
+    """Return the figure of held-out errors of this robot and of the others."""
+    errors = found.trust["held_out_error_over_path"]
+    data, every = [], []
+    for k, model in enumerate(ERRORS):
+        own = {
+            f: e.get(found.selected[f] if model == "selected" else model) for f, e in errors.items()
+        }
+        rows = [(f"this robot, {f}", 100 * e) for f, e in own.items() if e is not None]
+        rows += [(f"{b.robot}, {b.floor.replace('_', ' ')}", 100 * b.value) for b in bands[model]]
+        every += [error for _, error in rows]
+        data.append(
+            draw.dots(
+                [error for _, error in rows],
+                [name for name, _ in rows],
+                label(model),
+                colour(model),
+                marker={"size": 9, "opacity": 1, "symbol": draw.SYMBOLS[k]},
+                hovertemplate="%{y}: %{x:.2f} % of the path<extra>%{fullData.name}</extra>",
+            )
+        )
+    selected = data[-1]
+    own = [x for x, y in zip(selected["x"], selected["y"], strict=True) if y.startswith("this")]
+    least = [b.value for b in bands["selected"]]
+    title = (
+        f"This robot is predicted within {min(own):.2g} to {max(own):.2g} % of the path, others "
+        f"within {100 * min(least):.2g} to {100 * max(least):.2g} %"
+    )
+    x = draw.axis("error on held-out runs [% of the path]")
+    x |= {"type": "log"} if is_wide(every) else {"rangemode": "tozero"}
+    y = {"automargin": True, "autorange": "reversed"}
+    layout = {"xaxis": x, "yaxis": y, "showlegend": True}
+    alt = f"{title}. Dots show the errors of three models on every floor of every robot."
+    rows_shown = len(set(selected["y"]))
+    return FigureBlock("others", title, alt, data, layout, "", 140 + 26 * rows_shown, minimum=460)
+
+
+def _numbers(found: Results) -> TableBlock:
+    """Return the table of numbers of this robot beside those of the others."""
+    rows = [row for path, text in OTHERS.items() for row in _rows(found, path, text)]
+    head = ("number", "robot and floor", "value", "90 % interval")
+    caption = "Numbers of this robot and of the others, as means over the drives."
+    return TableBlock(caption, head, rows, right=("value",), folded=True)
+
+
+def _rows(found: Results, path: str, text: str) -> Iterator[Sequence[Cell]]:
+    for floor in found.floors:
+        if (own := _own(found, path.replace("*", floor))) is not None:
+            yield text, f"this robot, {floor}", number(own[0], 3), interval(own[1], 3)
+    for band in reference_bands(found.drive, path):
+        where = f"{band.robot}, {band.floor.replace('_', ' ')}"
+        yield text, where, number(band.value, 3), interval(band.interval90, 3)
+
+
+def _own(found: Results, path: str) -> tuple[float, Sequence[float] | None] | None:
+    """Return a number of this robot and its interval; None if the logs do not determine it."""
+    first, *rest = path.split(".")
+    if first == "surface":
+        e = found.parameters.get(path)
+        known = e is not None and e["verdict"] in ("identified", "weak", "disputed")
+        return (e["value"], e["interval90"]) if e is not None and known else None
+    if found.calibration is None:
+        return None
+    floor, length = rest[-2:]
+    value = found.calibration["multipliers"].get(floor, {}).get(length)
+    if value is None:
+        return None
+    return (sum(value) / len(value) if isinstance(value, list) else value), None
