@@ -10,10 +10,13 @@ import numpy as np
 from slipid.app.bench_priors import COPY_NAME
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask
+from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration.result import ABSURD, Calibration
 from slipid.infer.fit_file import FIT, IDENTIFIED, SCHEMA
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
+from slipid.model.geometry import Geometry
+from slipid.model.robot import Robot
 from slipid.predict.selection import (
     CONTRADICTION,
     FloorSelection,
@@ -243,6 +246,43 @@ def calibrate_only(
     write_json(out / IDENTIFIED, content)
     write_run(task, found.trust, data, out, time.monotonic() - began)
     return replace(found, written=(IDENTIFIED, "run.json", "config.toml"))
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFile:
+    """Calibration in the identified.json of a result without a force balance.
+
+    Attributes:
+        calibration: the calibration.
+        models: name of the selected kinematic model, keyed by floor.
+        runs: names of the calibrated runs.
+    """
+
+    calibration: Calibration
+    models: Mapping[str, str]
+    runs: tuple[str, ...]
+
+    def seen(self, shape: Geometry, data: Runs) -> Robot:
+        """Return the robot with the calibrated pose sensor, for runs on the calibrated floors."""
+        loads, sessions = (sorted(set(x)) for x in ((one.load for one in data.logs), data.session))
+        robot = Robot.of(shape).on(sorted(self.calibration.radius), loads, sessions)
+        return self.calibration.seen(robot)
+
+
+def read_calibration(out: Path) -> CalibrationFile:
+    """Return the calibration that `identify --only calibration` wrote to a folder.
+
+    Raises:
+        DataError: there is no such file, or no calibration in it.
+    """
+    content = read_json(out / IDENTIFIED, "a result of `slipid identify`")
+    try:
+        calibration, models = Calibration.of_json(content["calibration"]), content["selected_model"]
+        return CalibrationFile(calibration, models, tuple(content["data"]["runs"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{out / IDENTIFIED}: no calibration ({error}); run `slipid identify` again"
+        ) from error
 
 
 def write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:

@@ -10,16 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.app.calibrate import calibrated
+from slipid.app.calibrate import calibrated, read_calibration
 from slipid.app.config import Config, read_config, single_floor_sections
 from slipid.app.logs import read_dataset
 from slipid.app.problem import ConfigFitTask, read_fit_task, shape_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import FitState, Problem
-from slipid.infer.fit_file import IDENTIFIED, load
+from slipid.infer.fit_file import load
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot
 from slipid.predict.folds import Fold, folds_of, judge
@@ -31,7 +30,7 @@ from slipid.predict.validation import ScoredRun, Validation, validation
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import read_json, writable, write_json
+from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -219,22 +218,13 @@ def validate_calibration(
     Arguments and errors are those of `validate`.
     """
     setup_jax(quiet=True)
-    content = read_json(out / IDENTIFIED, "a result of `slipid identify`")
-    try:
-        found, chosen = Calibration.of_json(content["calibration"]), content["selected_model"]
-        fitted = set(content["data"]["runs"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{out / IDENTIFIED}: no calibration ({error}); run `slipid identify` again"
-        ) from error
+    found = read_calibration(out)
     config, dataset = _judged(out, data, report, glob)
-    shape = shape_of(config)
-    floors, loads = sorted(found.radius), sorted({log.load for log in dataset.logs})
-    robot = Robot.of(shape).on(floors, loads, sorted(set(dataset.session)))
+    shape, fitted = shape_of(config), set(found.runs)
     new = sum(log.name not in fitted for log in dataset.logs)
     report.stage("predicting")
-    models = [FloorModels(nominal(shape)), calibrated_model(found, shape)]
-    return validation(None, models, dataset, new, found.seen(robot), chosen)
+    models = [FloorModels(nominal(shape)), calibrated_model(found.calibration, shape)]
+    return validation(None, models, dataset, new, found.seen(shape, dataset), found.models)
 
 
 def _judged(out: Path, data: Path, report: Reporter, glob: str | None) -> tuple[Config, Runs]:

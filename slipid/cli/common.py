@@ -134,9 +134,10 @@ def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
     def checked(*args: Words.args, **options: Words.kwargs) -> int:
         paths = (value for value in (*args, *options.values()) if isinstance(value, Path))
         if (first := next(paths, None)) is not None and is_bench(first):
+            name = command.__name__.replace("_", "-")
             raise DataError(
                 f"{first}: drive = 'motor' describes motors on a bench, for which `slipid "
-                f"{command.__name__}` is not made; expected `slipid check`, `identify` or "
+                f"{name}` is not made; expected `slipid check`, `identify` or "
                 "`motor`. The config of a robot can use the result by [robot] motor = 'FILE'"
             )
         return command(*args, **options)

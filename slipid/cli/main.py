@@ -21,6 +21,7 @@ from slipid.cli.check import check
 from slipid.cli.demo import demo
 from slipid.cli.design import design
 from slipid.cli.export import export
+from slipid.cli.export_run import export_run
 from slipid.cli.floors import floors
 from slipid.cli.identify import identify
 from slipid.cli.map import map_
@@ -84,6 +85,11 @@ PANELS: dict[str, tuple[Command, ...]] = {
             report,
             "Write the page of a fit again, with all results since",
             "slipid report out/robot",
+        ),
+        Command(
+            export_run,
+            "Write a run and its predictions for Foxglove and rerun",
+            "slipid export-run out/robot run000.csv --out run.mcap",
         ),
         Command(
             compare,
@@ -197,7 +203,7 @@ def _section(formatter: Any, title: str) -> "AbstractContextManager[None]":
 
 def _name(command: Command) -> str:
     # `map_` only keeps the name of Python's built-in map free
-    return command.run.__name__.rstrip("_")
+    return command.run.__name__.rstrip("_").replace("_", "-")
 
 
 def _help(command: Command) -> str:

@@ -140,10 +140,7 @@ def with_kinematics(
             effect=effect,
             wheelbase=found.nominal_base * base_ratio if shape.driven else None,
         )
-        # what uncertain lengths do per metre: a radius to the distance, radii and base to the yaw
-        std = max(v.std / v.value for v in found.radius[floor.name])
-        of_base = found.base[floor.name].std / found.base[floor.name].value
-        spread[k] = (std, 0.0, float(np.hypot(std, of_base)) / found.base[floor.name].value)
+        spread[k] = found.spread(floor.name)
     loads = tuple(_without_effects(load, floors, spread) for load in record.loads)
     steering = None
     if found.steering:

@@ -20,7 +20,6 @@ from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.predictive import (
     ForceBalance,
-    PointSlopes,
     PredictiveModel,
     Residuals,
     Slopes,
@@ -79,7 +78,7 @@ class FittedSlipModel(PredictiveModel):
         by_camera = by_z[..., self.contact.camera]
         return residual(model), np.concatenate([slopes(model, w, residual), by_camera], axis=-1)
 
-    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, PointSlopes]:
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
         robot, contact = self.robot, self.contact
 
         def tracks_of(model: FloorModels) -> replay.Tracks:
@@ -87,8 +86,8 @@ class FittedSlipModel(PredictiveModel):
 
         tracks = tracks_of(self.model)
         twist, start = self.model.twist(w, robot), tracks.predicted[:, 0]
-        camera = replay.path_jacobian(contact.space, contact.z, lk.batch(w, robot), start, twist)
-        own = slopes(self.model, w, lambda model: tracks_of(model).predicted[:, 1:, :2])
+        camera = replay.end_jacobian(contact.space, contact.z, lk.batch(w, robot), start, twist)
+        own = slopes(self.model, w, lambda model: tracks_of(model).predicted[:, -1, :2])
         return tracks, np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
 
 

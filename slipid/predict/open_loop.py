@@ -1,4 +1,4 @@
-"""Open-loop prediction of paths from the first pose, with the uncertainty of their points.
+"""Open-loop prediction of paths from the first pose, with the uncertainty of their end points.
 
 All poses are in metres as corrected by the fitted camera. A prediction uses only the first of the
 measured poses.
@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
@@ -141,79 +141,116 @@ def tracks_from_increments(
 
 
 @eqx.filter_jit
-def path_jacobian(
+def end_jacobian(
     space: Space,
     z: Numbers,
     b: lk.Batch,
     start: Numbers,
     twist: Numbers | None = None,
     effects: tuple[Numbers, Numbers] | None = None,
-) -> Float[Array, "segment window 2 free"]:
-    """Return the derivative of the points of paths with respect to the search vector.
-
-    The start poses are fixed; there is a point after every window.
+) -> Float[Array, "segment 2 free"]:
+    """Return the derivative of end points with respect to the search vector, for fixed start poses.
 
     The path follows body twists (segment, window, 3) if `twist` is given, else the contact
     equilibrium. `effects`, if given, holds the increments by expected shared effects (segment,
     window, 3) [m, m, rad], which are subtracted, and their derivative with respect to the search
     vector.
     """
-
-    def path(x: Array) -> Array:
-        robot = space.tree(x)
-        if twist is not None:
-            step = lk.marker_increments(robot, jnp.asarray(twist), b.dt, b.session)
-        else:
-            step = contact_increments(robot, b)
-        if effects is not None:
-            mean, slope = effects
-            step -= mean + slope @ (x - jnp.asarray(z))
-        return chain(start, step)[:, 1:, :2]
-
-    return jax.jacfwd(path)(z)
+    return jax.jacfwd(lambda x: _path(space, x, z, b, start, twist, effects)[:, -1, :2])(z)
 
 
-def path_covariance(
+@eqx.filter_jit
+def path_jacobian(
+    space: Space, z: Numbers, b: lk.Batch, start: Numbers, effects: tuple[Numbers, Numbers]
+) -> Float[Array, "segment edge 3 free"]:
+    """Return the derivative of all poses of the contact equilibrium's paths.
+
+    Arguments are those of `end_jacobian`.
+    """
+    return jax.jacfwd(lambda x: _path(space, x, z, b, start, None, effects))(z)
+
+
+def _path(
+    space: Space,
+    x: Array,
+    z: Numbers,
+    b: lk.Batch,
+    start: Numbers,
+    twist: Numbers | None,
+    effects: tuple[Numbers, Numbers] | None,
+) -> Float[Array, "segment edge 3"]:
+    """Return the poses at the search vector `x`; `effects` are known at `z`."""
+    robot = space.tree(x)
+    if twist is not None:
+        step = lk.marker_increments(robot, jnp.asarray(twist), b.dt, b.session)
+    else:
+        step = contact_increments(robot, b)
+    if effects is not None:
+        mean, slope = effects
+        step -= mean + slope @ (x - jnp.asarray(z))
+    return chain(start, step)
+
+
+def end_covariance(
     robot: Robot,
     w: Windows,
     tracks: Tracks,
     variance: Mapping[str, float],
     shared: Float[np.ndarray, "segment 3 3"],
     of_parameters: Float[np.ndarray, "segment 2 2"],
-    edge: int = -1,
-    motion: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Float[np.ndarray, "segment 2 2"]:
-    """Return the scale matrices of the Student t of predicted less measured points of paths [m^2].
+    """Return the scale matrices of the Student t of predicted less measured end points [m^2].
 
-    The matrices include process noise, the individual run effect, shared effects, camera noise of
-    the first position, of the position at the edge and of the start heading, and the uncertainty of
-    the parameters; each is propagated to the point along the predicted path.
+    See `path_covariance`; `of_parameters` is the covariance of the end points due to uncertain
+    parameters.
+    """
+    p, last = tracks.predicted, tracks.predicted.shape[1] - 1
+    found = path_covariance(robot, w, p, variance, shared, [last], p[:, [last], :2])
+    return of_parameters + found[:, 0]
+
+
+def path_covariance(
+    robot: Robot,
+    w: Windows,
+    predicted: Float[np.ndarray, "segment edge 3"],
+    variance: Mapping[str, float],
+    shared: Float[np.ndarray, "segment 3 3"],
+    edges: Sequence[int] | Int[np.ndarray, " picked"],
+    point: Float[np.ndarray, "segment picked 2"],
+    motion: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Float[np.ndarray, "segment picked 2 2"]:
+    """Return the scale matrices of predicted less measured positions, for known parameters [m^2].
+
+    The matrices include process noise, the individual run effect, shared effects, and camera noise
+    of the first and of the later position and of the start heading; each is propagated along the
+    predicted path.
 
     Args:
-        robot: robot with its camera.
-        w: windows of the runs.
-        tracks: predicted paths of the runs.
+        robot: robot with the camera and the geometry.
+        w: whole runs, one segment each.
+        predicted: predicted marker poses at the edges of the windows.
         variance: variances of the noise components, keyed by name.
         shared: covariance of the shared effects along, across and in yaw.
-        of_parameters: covariance of the points due to uncertain parameters.
-        edge: index of the point on the path, by default its end.
+        edges: indices of the edges at which the position is predicted.
+        point: predicted position at these edges, that of the marker or of another point of the
+            robot [m].
         motion: distance and direction of every window, by default those by the encoders.
     """
     far, u = motion or travel(w, robot)
-    p = tracks.predicted[:, : edge % tracks.predicted.shape[1] + 1]
-    far, u = far[:, : p.shape[1] - 1], u[:, : p.shape[1] - 1]
-    cov = of_parameters.copy()
-    # Vector by which the point shifts per radian of yaw in each step.
-    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])
-    yaw = p[:, :-1, 2]
-    along, across = turned(yaw, u), turned(yaw, turned_left(u))
+    heading, begin = predicted[:, :-1, 2], predicted[:, 0, :2]
+    along, across = turned(heading, u), turned(heading, turned_left(u))
     process, run = (by_axis(variance, k, w) for k in ("process", "run"))
-    axes = np.stack((along, across, lever))
-    cov += np.einsum("na,nk,anki,ankj->nij", process, far, axes, axes)
-    whole = np.einsum("nk,anki->nai", far, axes)
-    effect = shared + run[:, :, None] * np.eye(len(axes))
-    cov += np.einsum("nab,nai,nbj->nij", effect, whole, whole)
-    turn = turned_left(p[:, -1, :2] - p[:, 0, :2])
-    cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
-    cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
-    return cov
+    effect = shared + run[:, :, None] * np.eye(3)
+    of_place = 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
+    out = np.empty((len(w), len(edges), 2, 2))
+    for k, end in enumerate(edges):
+        # Vector by which the position shifts per radian of yaw in each step.
+        lever = turned_left(point[:, [k]] - predicted[:, 1 : end + 1, :2])
+        axes, steps = np.stack((along[:, :end], across[:, :end], lever)), far[:, :end]
+        whole = np.einsum("nk,anki->nai", steps, axes)
+        turn = turned_left(point[:, k] - begin)
+        out[:, k] = np.einsum("na,nk,anki,ankj->nij", process, steps, axes, axes)
+        out[:, k] += np.einsum("nab,nai,nbj->nij", effect, whole, whole)
+        out[:, k] += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
+        out[:, k] += of_place
+    return out

@@ -17,7 +17,7 @@ the camera propagate to the coefficients of the simpler models.
 """
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -51,12 +51,11 @@ from slipid.fitting.variances import (
 )
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
-from slipid.predict.slip_model import setups
+from slipid.predict.slip_model import body_poses, setups, turned_left
 from slipid.search_space import Space
 
 Residuals = Float[np.ndarray, "segment m"]
 Slopes = Float[np.ndarray, "segment m number"]
-PointSlopes = Float[np.ndarray, "segment window 2 number"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,32 +97,14 @@ class PredictiveModel(abc.ABC):
         """
 
     @abc.abstractmethod
-    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, PointSlopes]:
-        """Return tracks of whole runs and the derivatives of their points.
-
-        The derivatives have the shape (segment, window, 2, number).
-        """
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
+        """Return tracks of whole runs and the derivatives of end points (segment, 2, number)."""
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
         """Return tracks of whole runs and the scale matrices [m^2] of their end points."""
-        tracks, (end,) = self.points(w, (w.dt.shape[1],))
-        return tracks, end
-
-    def points(
-        self, w: Windows, edges: Sequence[int]
-    ) -> tuple[replay.Tracks, list[Float[np.ndarray, "segment 2 2"]]]:
-        """Return tracks of whole runs, and the scale matrices [m^2] of their points at `edges`.
-
-        Edges are counted from 1, the point after the first window.
-        """
         tracks, slope = self.tracks_and_slopes(w)
-        effect, known = self.effect_covariance(w), (self.robot, w, tracks, self.variance)
-        return tracks, [
-            replay.path_covariance(
-                *known, effect, self._number_covariance(w, slope[:, edge - 1]), edge
-            )
-            for edge in edges
-        ]
+        numbers, effect = self._number_covariance(w, slope), self.effect_covariance(w)
+        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, numbers)
 
     def scale(self, problem: Problem) -> tuple[Residuals, Float[np.ndarray, "segment m m"]]:
         """Return every segment's residuals, and the scale matrix of their Student t."""
@@ -260,12 +241,38 @@ class ForceBalance(PredictiveModel):
         mean = self._correction(w)[0].reshape(increments.shape)
         return replay.tracks_from_increments(self.robot, w, increments - mean)
 
-    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, PointSlopes]:
-        tracks, (mean, slope) = self.tracks(w), self._correction(w)
-        expected = mean.reshape(*w.dt.shape, 3), slope.reshape(*w.dt.shape, 3, -1)
-        b, start = lk.batch(w, self.robot), tracks.predicted[:, 0]
-        by_z = replay.path_jacobian(self.space, self.z, b, start, effects=expected)
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
+        tracks, b = self.tracks(w), lk.batch(w, self.robot)
+        start, expected = tracks.predicted[:, 0], self._expected_increments(w)
+        by_z = replay.end_jacobian(self.space, self.z, b, start, effects=expected)
         return tracks, np.asarray(by_z)
+
+    def body_paths(
+        self, w: Windows
+    ) -> tuple[Float[np.ndarray, "segment edge 3"], Float[np.ndarray, "segment edge 2 2"]]:
+        """Return predicted poses of the body in whole runs, and the scale matrices of positions.
+
+        The scale matrices [m^2] are those of predicted less measured positions of the body at each
+        edge between measured poses; the last one is that of `ends` if the marker is at the body's
+        middle.
+        """
+        p, b = self.tracks(w).predicted, lk.batch(w, self.robot)
+        body, picked = body_poses(self.robot, w.session, p), np.arange(0, p.shape[1], w.parts)
+        expected = self._expected_increments(w)
+        jacobian = replay.path_jacobian(self.space, self.z, b, p[:, 0], expected)
+        by_z = np.asarray(jacobian)[:, picked]
+        # the body turns about the marker
+        lever = turned_left(body[:, picked, :2] - p[:, picked, :2])
+        by_z = by_z[:, :, :2] + lever[..., None] * by_z[:, :, 2:]
+        of_numbers = [self._number_covariance(w, by_z[:, k]) for k in range(len(picked))]
+        shared, point = self.effect_covariance(w), body[:, picked, :2]
+        cov = replay.path_covariance(self.robot, w, p, self.variance, shared, picked, point)
+        return body[:, picked], cov + np.stack(of_numbers, axis=1)
+
+    def _expected_increments(self, w: Windows) -> tuple[np.ndarray, np.ndarray]:
+        """Return the increments (segment, window, 3) of expected effects, and their derivative."""
+        mean, slope = self._correction(w)
+        return mean.reshape(*w.dt.shape, 3), slope.reshape(*w.dt.shape, 3, -1)
 
 
 def force_balance_of(

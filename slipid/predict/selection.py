@@ -172,8 +172,8 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
         whole_poses = np.array([incomplete_poses(data, run) is None for run in runs.tolist()])
         for run in runs[~whole_poses].tolist():
             fitted = own.fitted[data.surface[run]]
-            errors["nominal"][run] = aligned_error(data, run, plain.model, seen)
-            errors["calibrated"][run] = aligned_error(data, run, fitted, seen)
+            errors["nominal"][run] = aligned_path(data, run, plain.model, seen).error
+            errors["calibrated"][run] = aligned_path(data, run, fitted, seen).error
         runs = runs[whole_poses]
         for w in replay.replay_windows(data.subset(runs), seen) if len(runs) else ():
             cases = {"nominal": (plain, w), "calibrated": (own, w)}
@@ -191,8 +191,23 @@ PARTS_OF_GAP, LONGEST_PART_S = 4, 0.2
 for an aligned path."""
 
 
-def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float:
-    """Return the error over the path length of a run whose poses lack coordinates.
+@dataclass(frozen=True, eq=False)
+class AlignedPath:
+    """Predicted path of the body in a run whose poses lack coordinates, moved to the measured ones.
+
+    Attributes:
+        time: time in the run of each pose, on the clock of the wheels [s].
+        pose: x, y [m] and heading [rad].
+        error: error over the path length [1].
+    """
+
+    time: Float[np.ndarray, " edge"]
+    pose: Float[np.ndarray, "edge 3"]
+    error: float
+
+
+def aligned_path(data: Runs, run: int, model: TwistModel, seen: Robot) -> AlignedPath:
+    """Return the predicted path of a run whose poses lack coordinates.
 
     The start of such a run is not known. The whole predicted path of the pose sensor is therefore
     aligned with the measured positions, by a rotation and a translation (Procrustes), and the error
@@ -218,22 +233,29 @@ def aligned_error(data: Runs, run: int, model: TwistModel, seen: Robot) -> float
     signals = RunSignals(data.logs[run].name, np.diff(edges), turn)
     path = path_of(model.twist(Steps(signals, np.zeros(1, int)), spec), signals.dt)
     length = max(float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()), 1e-9)
-    path = path[index]
-    offset = np.broadcast_to(np.asarray(seen.camera.marker_place), (len(path), 2))
+    picked = path[index]
+    offset = np.broadcast_to(np.asarray(seen.camera.marker_place), (len(picked), 2))
     known = np.isfinite(pose[:, :2]).all(axis=1)
-    if known.sum() < 2:
-        off = path[:, 2] - pose[:, 2]
-        return 0.5 * nominal_base(seen.geometry) * float(np.nanstd(off)) / length
     found, measured = (
-        (x[known, 0] + 1j * x[known, 1]) for x in (path[:, :2] + turned(path[:, 2], offset), pose)
+        (x[known, 0] + 1j * x[known, 1])
+        for x in (picked[:, :2] + turned(picked[:, 2], offset), pose * float(seen.camera.scale))
     )
-    if len(pose) == 2 and np.isfinite(pose[0]).all():
-        found, measured = np.diff(found), np.diff(measured) * float(seen.camera.scale)
-        heading = pose[0, 2] - float(seen.camera.marker_yaw) - path[0, 2]
-        return float(np.abs(found * np.exp(1j * heading) - measured)[0]) / length
-    found, measured = found - found.mean(), (measured - measured.mean()) * float(seen.camera.scale)
-    turn_by = np.exp(1j * np.angle(np.vdot(found, measured)))
-    return float(np.sqrt(np.mean(np.abs(found * turn_by - measured) ** 2))) / length
+    ahead, shift = pose[:, 2] - float(seen.camera.marker_yaw) - picked[:, 2], 0j
+    if known.sum() < 2:
+        rotation = float(np.nanmean(ahead))
+        error = 0.5 * nominal_base(seen.geometry) * float(np.nanstd(ahead))
+    elif len(pose) == 2 and np.isfinite(pose[0]).all():
+        rotation = float(ahead[0])
+        shift = measured[0] - found[0] * np.exp(1j * rotation)
+        error = float(np.abs(found[1] * np.exp(1j * rotation) + shift - measured[1]))
+    else:
+        middle = found.mean(), measured.mean()
+        rotation = float(np.angle(np.vdot(found - middle[0], measured - middle[1])))
+        shift = middle[1] - middle[0] * np.exp(1j * rotation)
+        left = found * np.exp(1j * rotation) + shift - measured
+        error = float(np.sqrt(np.mean(np.abs(left) ** 2)))
+    place = turned(rotation, path[:, :2]) + np.array([shift.real, shift.imag])
+    return AlignedPath(edges, np.column_stack([place, path[:, 2] + rotation]), error / length)
 
 
 def _mislabelled(data: Runs, errors: Errors, floors: Sequence[str]) -> Iterator[str]:

@@ -46,6 +46,21 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
     return np.concatenate([arc, yaw[..., None]], -1) / w.dt[..., None]
 
 
+def body_poses(
+    robot: Robot, session: Sequence[str], marker: Float[np.ndarray, "run edge 3"]
+) -> Float[np.ndarray, "run edge 3"]:
+    """Return the poses of the body, given those of its marker in runs of the named sessions.
+
+    Both are in true metres.
+    """
+    yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(session)}
+    out = marker.copy()
+    out[..., 2] -= np.array([yaws[s] for s in session])[:, None]
+    place = np.broadcast_to(np.asarray(robot.camera.marker_place), out[..., :2].shape)
+    out[..., :2] -= turned(out[..., 2], place)
+    return out
+
+
 def setups(w: Windows) -> list[str]:
     """Return the floor and load set-up of every segment as `floor@load`."""
     return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]

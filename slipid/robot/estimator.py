@@ -92,7 +92,9 @@ class Estimator(AbstractEstimator[EstimatorState]):
         self.settings = as_arrays(Settings.of(robot) if settings is None else settings)
 
     def init(
-        self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
+        self,
+        pose: Pose = (0.0, 0.0, 0.0),
+        std: tuple[float, float] | Float[Array, "2"] = (0.0, 0.0),
     ) -> EstimatorState:
         """Return the state of a robot at rest at a pose [m, m, rad] with stds [m], [rad]."""
         return self._state_at(as_numbers(pose), as_numbers(std))

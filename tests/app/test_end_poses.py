@@ -140,3 +140,11 @@ def test_identify_calibrates_such_runs_and_predicts_their_ends(squares, tmp_path
     assert errors["nominal"] > 0.03
     assert errors["calibrated"] < 0.004
     assert "little of the mean wheel radius: drive some metres" in " ".join(done.stdout.split())
+    words = ("floor/" + lines[0][0].rpartition("/")[2], "--out", tmp_path / "run.mcap")
+    done = invoke("export-run", tmp_path, *words, "--json", tmp_path / "topics.json", "--quiet")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads((tmp_path / "topics.json").read_text())
+    assert found["topics"]["/pose/measured"]["messages"] == 2
+    assert found["topics"]["/pose/selected"]["messages"] > 20
+    assert "/region90/selected" not in found["topics"]
+    assert "aligned with the measured poses" in " ".join(found["notes"])

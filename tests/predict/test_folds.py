@@ -90,10 +90,10 @@ def test_a_camera_errs_at_both_ends_of_a_way_and_turns_it_by_the_heading_at_its_
     )
     none = np.zeros((4, 3, 3)), np.zeros((4, 2, 2))
     variance = {"camera.place": 4e-6, "camera.heading": 0.0}
-    found = replay.path_covariance(ROBOT, w, tracks, variance, *none)
+    found = replay.end_covariance(ROBOT, w, tracks, variance, *none)
     np.testing.assert_allclose(found, [2 * 4e-6 * SCALE**2 * np.eye(2)] * 4, rtol=1e-12)
     variance = {"camera.place": 0.0, "camera.heading": 9e-6}
-    found = replay.path_covariance(ROBOT, w, tracks, variance, *none)
+    found = replay.end_covariance(ROBOT, w, tracks, variance, *none)
     way = (tracks.predicted[:, -1] - tracks.predicted[:, 0])[:, :2]
     across = way[:, ::-1] * [-1.0, 1.0]
     expected = 9e-6 * across[:, :, None] * across[:, None, :]

@@ -28,16 +28,16 @@ def test_paths_and_regions_are_those_of_the_fit(made):
     evidence, fit, data = made
     assert [run.name for run in evidence.runs] == [log.name for log in data.logs]
     for w in replay_windows(data, fit.robot):
-        tracks, scale = fit.contact.ends(w)
+        pose, scale = fit.contact.body_paths(w)
         for n, k in enumerate(w.run.tolist()):
             run = evidence.runs[k]
             end = run.models["contact"]
             found = np.array([end.x_mm[-1], end.y_mm[-1], end.yaw_mrad[-1]])
-            np.testing.assert_allclose(found, 1000 * tracks.predicted[n, -1], atol=0.51)
+            np.testing.assert_allclose(found, 1000 * pose[n, -1], atol=0.51)
             assert run.region is not None
             assert run.region.edge[-1] == len(run.time_s) - 1
             area = run.region.major_mm[-1] * run.region.minor_mm[-1]
-            expected = 2e6 * fdtri(2, DEGREES, 0.9) * np.sqrt(np.linalg.det(scale[n]))
+            expected = 2e6 * fdtri(2, DEGREES, 0.9) * np.sqrt(np.linalg.det(scale[n, -1]))
             assert area == pytest.approx(expected, rel=0.05)
             assert np.all(np.diff(run.region.major_mm) > -0.2)  # a path becomes more uncertain
 
@@ -57,7 +57,7 @@ def test_errors_of_quarters_add_up_to_those_of_the_runs(made):
         along = sum(q.along_mm_s[n] * q.seconds[n] for n in mine)
         across = sum(q.across_mm_s[n] * q.seconds[n] for n in mine)
         # straight runs: errors in the body frames of the quarters add up but for the yaw's lever
-        whole = 1000 * end_error(run, run.selected) * run.path_m
+        whole = 1000 * end_error(run, run.selected)
         assert np.hypot(along, across) < whole + 0.1 * 1000 * run.path_m
         assert sum(q.seconds[n] for n in mine) == pytest.approx(run.seconds, abs=0.05)
     assert all(0 <= h < 360 for h in q.heading_deg if h is not None)

@@ -182,6 +182,15 @@ class Calibration:
         base = np.log(self.base[floor].value / self.nominal_base)
         return np.array([*radius, base, centre, *steering])
 
+    def spread(self, floor: str) -> tuple[float, float, float]:
+        """Return the std of motion along, across and in yaw per metre due to uncertain lengths.
+
+        A radius changes the distance, radii and base change the yaw [m/m, m/m, rad/m].
+        """
+        base = self.base[floor]
+        radius = max(v.std / v.value for v in self.radius[floor])
+        return radius, 0.0, float(np.hypot(radius, base.std / base.value)) / base.value
+
     def seen(self, robot: Robot) -> Robot:
         """Return a robot whose poses are measured by the calibrated pose sensor.
 

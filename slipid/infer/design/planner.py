@@ -22,7 +22,7 @@ from slipid.infer.design.planned_runs import SESSION, PlannedRun, Setup, steady_
 from slipid.infer.result import Channels, Fit
 from slipid.model.robot import Robot
 from slipid.parameter import entries
-from slipid.predict.open_loop import path_jacobian
+from slipid.predict.open_loop import end_jacobian
 from slipid.search_space import Choice
 
 _RUNS_PER_CALL = 256
@@ -138,8 +138,7 @@ class Planner:
         sessions are not part of a prediction.
         """
         b = lk.batch(self._windows(runs, session=""), self.robot)
-        start = np.zeros((len(runs), 3))
-        jacobian = np.array(path_jacobian(self.space, self.z, b, start)[:, -1])
+        jacobian = np.array(end_jacobian(self.space, self.z, b, np.zeros((len(runs), 3))))
         jacobian /= np.array([d.distance for d in runs])[:, None, None]
         return np.pad(jacobian, ((0, 0), (0, 0), (0, self.effects)))
 

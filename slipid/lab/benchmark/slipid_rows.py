@@ -17,15 +17,22 @@ from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
 from slipid.deploy.deploy import robot_of_force_balance
 from slipid.deploy.floors import floor_of
+from slipid.deploy.replay import LONGEST_STEP_S
 from slipid.fitting import likelihood as lk
 from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import FitState, Problem
 from slipid.fitting.variances import DEGREES
 from slipid.infer.slip_curves import current_trend
-from slipid.lab.benchmark.steps import RunBatch, body_poses
+from slipid.lab.benchmark.steps import RunBatch
 from slipid.predict.folds import problem_of_runs
 from slipid.predict.predictive import ForceBalance, force_balance_of
-from slipid.predict.slip_model import PredictedRun, RobotSpec, RunSignals, relative_to_start
+from slipid.predict.slip_model import (
+    PredictedRun,
+    RobotSpec,
+    RunSignals,
+    body_poses,
+    relative_to_start,
+)
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, NO_FLOOR, Measurement, Settings
@@ -43,9 +50,6 @@ for few array sizes."""
 RUNS_PER_CALL = 32
 """Number of runs in one call of an estimator. Smaller numbers are padded, so that the estimator is
 compiled for a single array size."""
-LONGEST_STEP_S = 0.25
-"""Longest step given to an estimator [s]. Longer steps are split, since an estimator rejects steps
-of 0.5 s and more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +133,7 @@ def forecast(fit: SlipidFit, batch: RunBatch, spec: RobotSpec) -> list[Predicted
     w = batch.windows
     tracks, cov = fit.contact.ends(w)
     robot = fit.contact.robot
-    paths = body_poses(robot, w, tracks.predicted)
+    paths = body_poses(robot, w.session, tracks.predicted)
     has_current = fit.job.dataset.current is not None
     amps = np.abs(np.asarray(_currents(robot, lk.batch(w, robot)))) if has_current else None
 

@@ -14,7 +14,7 @@ from slipid.data.windows import Windows
 from slipid.fitting.likelihood import corrected
 from slipid.model.robot import Robot
 from slipid.predict import open_loop
-from slipid.predict.slip_model import Run, RunSignals, turned
+from slipid.predict.slip_model import Run, RunSignals, body_poses
 
 POSES_PER_STEP = 3
 """Minimum number of logged poses in each step, if a run has enough poses.
@@ -64,7 +64,7 @@ def _step_count(poses: float, poses_per_step: int) -> int:
 
 def _batch(data: Runs, robot: Robot, w: Windows) -> RunBatch:
     numbers = tuple(dict.fromkeys(w.run.tolist()))
-    pose = body_poses(robot, w, np.asarray(corrected(robot, jnp.asarray(w.pose))))
+    pose = body_poses(robot, w.session, np.asarray(corrected(robot, jnp.asarray(w.pose))))
     runs = []
     for n, k in enumerate(numbers):
         log = data.logs[k]
@@ -98,15 +98,3 @@ def _mean(
     inside = np.clip(edges, log.time[0], log.time[-1])
     total = np.diff(interpolate(log.time, integral(log.time, x), inside), axis=0)
     return np.asarray(total / np.maximum(np.diff(inside), 1e-9)[:, None])
-
-
-def body_poses(
-    robot: Robot, w: Windows, marker: Float[np.ndarray, "segment edge 3"]
-) -> Float[np.ndarray, "segment edge 3"]:
-    """Return the poses of the body, given the poses of its marker, both in true metres."""
-    yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
-    out = marker.copy()
-    out[..., 2] -= np.array([yaws[s] for s in w.session])[:, None]
-    place = np.broadcast_to(np.asarray(robot.camera.marker_place), out[..., :2].shape)
-    out[..., :2] -= turned(out[..., 2], place)
-    return out

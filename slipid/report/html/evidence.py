@@ -22,7 +22,7 @@ class _Record(BaseModel):
 
 
 class Track(_Record):
-    """Poses along a run, in the frame of the logged poses, as corrected by the camera.
+    """Poses of the body along a run, in the frame of the logged poses, corrected by the camera.
 
     Attributes:
         x_mm, y_mm: position [mm].

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import fdtri
@@ -11,18 +12,18 @@ from scipy.special import fdtri
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, incomplete_poses
 from slipid.fitting.calibration.result import Calibration
-from slipid.fitting.noise import travelled
-from slipid.fitting.shared_effects import AXES
+from slipid.fitting.likelihood import corrected
 from slipid.fitting.variances import DEGREES
 from slipid.infer.measured_windows import MeasuredWindows, driving_torque, measured_windows
 from slipid.infer.result import Fit
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
+from slipid.predict.body_path import LEVEL, kinematic_bodies, measured_path
 from slipid.predict.kinematics import nominal
 from slipid.predict.predictive import ForceBalance
-from slipid.predict.selection import calibrated_model
-from slipid.predict.slip_model import turned
+from slipid.predict.selection import aligned_path, calibrated_model
+from slipid.predict.slip_model import body_poses, turned
 from slipid.predict.slip_models import FloorModels
 from slipid.report.html import evidence as ev
 from slipid.support.errors import DataError
@@ -100,17 +101,22 @@ def evidence_of_predictions(
 ) -> ev.FitEvidence:
     """Return the evidence of predicted runs, without that of a force balance."""
     data, notes = models.data, list(notes)
-    reason = next(filter(None, (incomplete_poses(data, k) for k in range(len(data)))), None)
-    runs: list[ev.RunEvidence] = []
-    if reason is None:
-        runs = _paths(models)
-    else:
-        notes.append(f"no paths: {reason}")
+    reasons = [incomplete_poses(data, k) for k in range(len(data))]
+    runs = _paths(models, [k for k, reason in enumerate(reasons) if reason is None])
+    whole = set(runs)
+    for k, reason in enumerate(reasons):
+        if reason is not None and (run := _aligned(models, k)) is not None:
+            runs[k] = run
+    order = sorted(runs)
+    if not order:
+        notes.append("no paths: the logs have no positions")
+    elif reason := next(filter(None, reasons), None):
+        notes.append(f"paths are moved to the measured positions: {reason}")
     return ev.FitEvidence(
         data_hash=data_hash,
         wheels=_wheels(models.shape),
-        runs=runs,
-        quarters=_quarters(runs, data),
+        runs=[runs[k] for k in order],
+        quarters=_quarters([runs[k] if k in whole else None for k in order]),
         notes=notes,
     )
 
@@ -128,57 +134,55 @@ def _wheels(shape: Geometry) -> ev.WheelLayout:
 
 @dataclass(frozen=True, eq=False)
 class _Replay:
-    """Predicted paths of some runs.
+    """Predicted paths of the body in some runs.
 
     Attributes:
         w: windows of the runs, one segment each.
-        kept: indices of the poses that are kept of each path.
         paths: predicted poses (run, edge, 3) of every model, keyed by its name.
-        measured: measured poses (run, edge, 3) by which the selected model is judged.
-        regions: pose index, and scale matrices of the selected model's point (run, 2, 2) there.
+        measured: measured poses (run, edge, 3), by the camera of the selected model.
+        scale: scale matrices (run, edge, 2, 2) of the selected model's positions [m^2]; None if
+            there are none.
     """
 
     w: Windows
-    kept: np.ndarray
     paths: Mapping[str, Float[np.ndarray, "run edge 3"]]
     measured: Float[np.ndarray, "run edge 3"]
-    regions: Sequence[tuple[int, Float[np.ndarray, "run 2 2"]]]
+    scale: Float[np.ndarray, "run edge 2 2"] | None
 
 
-def _paths(models: Predictions) -> list[ev.RunEvidence]:
-    """Return the evidence of all runs in their order."""
+def _paths(models: Predictions, whole: Sequence[int]) -> dict[int, ev.RunEvidence]:
+    """Return the evidence of the runs with these indices, whose poses are whole."""
     out: dict[int, ev.RunEvidence] = {}
-    for done in _replayed(models):
-        for n, k in enumerate(done.w.run.tolist()):
-            if k not in out:
-                out[k] = _run(models, done, n, k)
-    return [out[k] for k in sorted(out)]
+    if whole:
+        for done in _replayed(models, models.data.subset(whole)):
+            for n, k in enumerate(done.w.run.tolist()):
+                out.setdefault(whole[k], _run(models, done, n, whole[k]))
+    return out
 
 
-def _replayed(models: Predictions) -> Iterator[_Replay]:
+def _replayed(models: Predictions, data: Runs) -> Iterator[_Replay]:
     """Yield predictions of some runs at a time."""
-    data, contact, seen = models.data, models.contact, models.seen
+    contact, seen = models.contact, models.seen
     for w in replay.replay_windows(data, seen if contact is None else contact.robot):
-        kept = _spread(w.dt.shape[1] // w.parts, MOST_POSES - 1) * w.parts
-        at = kept[_spread(len(kept) - 1, MOST_REGIONS)][1:]
-        late = w.at_lag(float(seen.camera.lag))
-        paths, regions = {}, []
+        paths: dict[str, Float[np.ndarray, "run edge 3"]] = {}
+        scale, measured = None, _measured(seen, w)
         for model in models.kinematic:
-            tracks = replay.tracks_from_increments(seen, w, model.increments(late, seen))
-            paths[model.name] = tracks.predicted
-        measured = tracks.measured
-        if models.calibration is not None:
-            regions = _kinematic_regions(models.calibration, seen, w, tracks, at)
+            noise = models.calibration if model.name == "calibrated" else None
+            paths[model.name], own = kinematic_bodies(model, seen, w, noise)
+            scale = own if own is not None else scale
         if contact is not None:
-            tracks, own = contact.points(w, at.tolist())
-            paths["contact"] = tracks.predicted
+            paths["contact"], of_contact = contact.body_paths(w)
             chosen = np.array([models.selected_on(f) == "contact" for f in w.surface])
-            chosen = chosen[:, None, None]
-            measured = np.where(chosen, tracks.measured, measured)
-            others = regions or own
-            regions = [np.where(chosen, a, b) for a, b in zip(own, others, strict=True)]
-        found = list(zip(at.tolist(), regions, strict=True)) if regions else []
-        yield _Replay(w, kept, paths, measured, found)
+            measured = np.where(chosen[:, None, None], _measured(contact.robot, w), measured)
+            others = of_contact if scale is None else scale
+            scale = np.where(chosen[:, None, None, None], of_contact, others)
+        yield _Replay(w, paths, measured, scale)
+
+
+def _measured(robot: Robot, w: Windows) -> Float[np.ndarray, "run edge 3"]:
+    """Return the measured poses of the body, corrected by a robot's camera."""
+    pose = np.asarray(corrected(robot, jnp.asarray(w.pose)))
+    return body_poses(robot, w.session, pose)[:, :: w.parts]
 
 
 def _spread(last: int, most: int) -> np.ndarray:
@@ -186,51 +190,60 @@ def _spread(last: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, last, min(last, most) + 1).round().astype(int))
 
 
-def _kinematic_regions(
-    calibration: Calibration, seen: Robot, w: Windows, tracks: replay.Tracks, at: np.ndarray
-) -> list[Float[np.ndarray, "run 2 2"]]:
-    """Return scale matrices of points predicted by calibrated kinematics.
-
-    They contain the noise of poses and motion, and the effects of runs, whose variances include
-    those of the calibrated numbers between runs.
-    """
-    noise = calibration.noise
-    variance = {"camera.place": noise.place**2, "camera.heading": noise.heading**2}
-    for kind, of_floor in (("process", noise.process), ("run", noise.effect)):
-        for floor, stds in of_floor.items():
-            names = (f"{kind}.{floor}.{axis}" for axis in AXES)
-            variance |= {name: std**2 for name, std in zip(names, stds, strict=True)}
-    p, none = tracks.predicted, (np.zeros((len(w), 3, 3)), np.zeros((len(w), 2, 2)))
-    step = np.diff(p, axis=1)
-    step[..., :2] = turned(-p[:, :-1, 2], step[..., :2])
-    motion = travelled(step, float(seen.geometry.base_radius))
-    return [
-        replay.path_covariance(seen, w, tracks, variance, *none, edge, motion)
-        for edge in at.tolist()
-    ]
-
-
 def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
     """Return the evidence of the run k, the n-th one of a replay."""
-    data, w, kept = models.data, done.w, done.kept
-    log, selected = data.logs[k], models.selected_on(data.surface[k])
-    time = np.concatenate([[0.0], np.cumsum(w.dt[n])])
-    measured = done.measured[n, :: w.parts, :2]
+    time = np.concatenate([[0.0], np.cumsum(done.w.dt[n])])[:: done.w.parts]
+    kept = _spread(len(time) - 1, MOST_POSES - 1)
+    paths = {name: path[n, kept] for name, path in done.paths.items()}
+    region = None if done.scale is None else _region(done.scale[n], kept)
+    return _evidence(models, k, time[kept], done.measured[n, kept], paths, region)
+
+
+def _aligned(models: Predictions, k: int) -> ev.RunEvidence | None:
+    """Return the evidence of a run whose poses lack coordinates; None for one without positions.
+
+    Its start is not known: predicted paths are moved to the measured positions.
+    """
+    data, seen = models.data, models.seen
+    measured = measured_path(data, k, seen)
+    if measured is None or len(measured.time) < 2:
+        return None
+    kept = _spread(len(measured.time) - 1, MOST_POSES - 1)
+    time, paths = measured.time[kept], {}
+    offset = np.broadcast_to(np.asarray(seen.camera.marker_place), (len(kept), 2))
+    for model in models.kinematic:
+        found = aligned_path(data, k, model.fitted.get(data.surface[k], model.model), seen)
+        x, y, yaw = (np.interp(time, found.time, column) for column in found.pose.T)
+        place = np.stack([x, y], axis=-1) + turned(yaw, offset)  # of the pose sensor
+        paths[model.name] = np.column_stack([place, yaw])
+    return _evidence(models, k, time - time[0], measured.pose[kept], paths, None)
+
+
+def _evidence(
+    models: Predictions,
+    k: int,
+    time: Float[np.ndarray, " edge"],
+    measured: Float[np.ndarray, "edge 3"],
+    paths: Mapping[str, Float[np.ndarray, "edge 3"]],
+    region: ev.PointRegions | None,
+) -> ev.RunEvidence:
+    """Return the evidence of the run k with its paths."""
+    data = models.data
     heading, speed = np.degrees(data.heading[k]), data.speed[k]
     return ev.RunEvidence(
-        name=log.name,
+        name=data.logs[k].name,
         floor=data.surface[k],
-        load=log.load,
+        load=data.logs[k].load,
         heading_deg=round(float(heading), 1) if np.isfinite(heading) else None,
         speed=round(float(speed), 3) if np.isfinite(speed) else None,
         seconds=round(float(time[-1]), 2),
         rest_s=round(_rest(data, k, float(models.shape.wheel_radius)), 2),
-        path_m=round(float(np.linalg.norm(np.diff(measured, axis=0), axis=1).sum()), 4),
-        time_s=np.round(time[kept], 2).tolist(),
-        measured=_track(done.measured[n, kept]),
-        models={name: _track(path[n, kept]) for name, path in done.paths.items()},
-        region=_region(done, n) if done.regions else None,
-        selected=selected,
+        path_m=round(float(np.linalg.norm(np.diff(measured[:, :2], axis=0), axis=1).sum()), 4),
+        time_s=np.round(time, 2).tolist(),
+        measured=_track(measured),
+        models={name: _track(path) for name, path in paths.items()},
+        region=region,
+        selected=models.selected_on(data.surface[k]),
     )
 
 
@@ -247,23 +260,27 @@ def _track(pose: Float[np.ndarray, "edge 3"]) -> ev.Track:
     return ev.Track(x_mm=x, y_mm=y, yaw_mrad=yaw)
 
 
-def _region(done: _Replay, n: int) -> ev.PointRegions:
-    """Return the 90 % regions of the n-th run of a replay."""
-    factor = np.sqrt(2 * fdtri(2, DEGREES, 0.9))
-    edges, axes, angles = [], [], []
-    for edge, scale in done.regions:
-        square, direction = np.linalg.eigh(scale[n])
-        edges.append(int(np.searchsorted(done.kept, edge)))
-        axes.append(1000 * factor * np.sqrt(np.maximum(square, 0.0)))
-        angles.append(round(1000 * float(np.arctan2(*direction[::-1, 1]))))
-    minor, major = np.round(axes, 1).T.tolist()
-    return ev.PointRegions(edge=edges, major_mm=major, minor_mm=minor, angle_mrad=angles)
+def _region(scale: Float[np.ndarray, "edge 2 2"], kept: np.ndarray) -> ev.PointRegions:
+    """Return the 90 % regions of a run at some of the kept poses."""
+    factor = np.sqrt(2 * fdtri(2, DEGREES, LEVEL))
+    at = _spread(len(kept) - 1, MOST_REGIONS)[1:]
+    square, direction = np.linalg.eigh(scale[kept[at]])
+    minor, major = np.round(1000 * factor * np.sqrt(np.maximum(square, 0.0)), 1).T.tolist()
+    angle = np.arctan2(direction[:, 1, 1], direction[:, 0, 1])
+    return ev.PointRegions(
+        edge=at.tolist(),
+        major_mm=major,
+        minor_mm=minor,
+        angle_mrad=np.round(1000 * angle).astype(int).tolist(),
+    )
 
 
-def _quarters(runs: Sequence[ev.RunEvidence], data: Runs) -> ev.Quarters:
-    """Return the quarters of runs, with the errors of the selected model."""
+def _quarters(runs: Sequence[ev.RunEvidence | None]) -> ev.Quarters:
+    """Return the quarters of runs, with the errors of the selected model; None is skipped."""
     columns: dict[str, list] = {name: [] for name in ev.Quarters.model_fields}
     for k, run in enumerate(runs):
+        if run is None:
+            continue
         measured, predicted = (_poses(t) for t in (run.measured, run.models[run.selected]))
         edges = np.linspace(0, len(run.time_s) - 1, QUARTERS + 1).round().astype(int)
         for i, j in pairwise(edges.tolist()):

@@ -98,7 +98,7 @@ class Player {
       const group = document.createElement("optgroup");
       group.label = floor;
       runs.forEach((run, k) => {
-        if (run.floor === floor) group.append(new Option(`${run.name} (off by ${run.error.toFixed(1)} %)`, k));
+        if (run.floor === floor) group.append(new Option(`${run.name} (ends ${run.error} mm off)`, k));
       });
       this.run.append(group);
     }

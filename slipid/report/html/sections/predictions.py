@@ -238,7 +238,7 @@ def _played(run: RunEvidence) -> Content:
         "models": {name: _flat(track) for name, track in run.models.items()},
         "region": region,
         "selected": run.selected,
-        "error": round(100 * end_error(run, run.selected), 2),
+        "error": round(1000 * end_error(run, run.selected)),
     }
 
 
@@ -247,10 +247,9 @@ def _flat(track: Track) -> list[list[int]]:
 
 
 def end_error(run: RunEvidence, model: str) -> float:
-    """Return the end-point error of a model over the measured path of a run [1]."""
+    """Return the end-point error of a model in a run [m]."""
     a, b = run.models[model], run.measured
-    off = np.hypot(a.x_mm[-1] - b.x_mm[-1], a.y_mm[-1] - b.y_mm[-1])
-    return float(off) / 1000 / max(run.path_m, 1e-9)
+    return float(np.hypot(a.x_mm[-1] - b.x_mm[-1], a.y_mm[-1] - b.y_mm[-1])) / 1000
 
 
 ERRORS: Mapping[str, tuple[str, str]] = {
