@@ -11,7 +11,7 @@ from slipid.deploy.deploy import calibrated_robot
 from slipid.fitting.calibration.result import Calibration
 from slipid.infer.verdicts.trust import Trust
 from slipid.model.robot import Robot
-from slipid.report.estimates import show_calibration, show_trust
+from slipid.report.calibration import show_calibration, show_trust
 from slipid.report.page import Page, text_of
 from slipid.robot.deployed import DeployedRobot
 from slipid.support.progress import Reporter

@@ -20,7 +20,7 @@ from slipid.lab.selftest import logs as known
 from slipid.lab.selftest.logs import simulate_logs
 from slipid.model.robot import Robot, steady_states
 from slipid.parameter import as_numbers
-from slipid.report.estimates import show_check
+from slipid.report.checks import show_check
 from slipid.report.page import text_of
 from slipid.support.content import Content
 from slipid.support.progress import Reporter

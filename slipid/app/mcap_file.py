@@ -2,12 +2,11 @@
 
 import io
 from dataclasses import dataclass, replace
-from importlib import import_module
 
 from slipid.app.run_messages import messages
 from slipid.app.run_view import RunView
 from slipid.support.checkpoint import versions
-from slipid.support.errors import DataError
+from slipid.support.extras import require
 
 
 @dataclass(frozen=True)
@@ -41,21 +40,16 @@ class McapFile:
 
 
 def require_mcap() -> None:
-    """Raise `DataError` if a package that writes MCAP files is missing."""
-    try:
-        for package in ("mcap_protobuf", "foxglove_schemas_protobuf"):
-            import_module(package)
-    except ImportError as error:
-        raise DataError(
-            f"MCAP files need {error.name}; expected: pip install 'slipid[mcap]'"
-        ) from error
+    """Raise `MissingExtra` if a package that writes MCAP files is missing."""
+    for package in ("mcap_protobuf", "foxglove_schemas_protobuf"):
+        require(package, "mcap", "an MCAP file")
 
 
 def mcap_of(view: RunView) -> McapFile:
     """Return the MCAP file of a run.
 
     Raises:
-        DataError: a package that writes MCAP files is missing.
+        MissingExtra: a package that writes MCAP files is missing.
     """
     require_mcap()
     from mcap.well_known import MessageEncoding

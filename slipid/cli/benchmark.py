@@ -5,7 +5,19 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, flag, guarded, option
+from slipid.cli.common import (
+    Jobs,
+    Json,
+    Next,
+    Out,
+    Quiet,
+    emit,
+    executor_of,
+    flag,
+    guarded,
+    option,
+    suggest,
+)
 from slipid.support.extras import require
 from slipid.support.progress import Reporter
 
@@ -43,9 +55,10 @@ def benchmark(
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
         found = run(BenchmarkOptions(data, out, only, quick), executor, report)
         report.stage("writing the page")
-        written = ("benchmark.json", *try_page(benchmark_page(found), out / PAGE, report))
-        report.line(f"written to {out}: {', '.join(written)}")
-    emit(json, found, lambda page: show_benchmark(page, found))
+        files = (*try_page(benchmark_page(found), out / PAGE, report), "benchmark.json")
+    words = ("compare", "robot.toml", "--data", "logs", "--out", "out/compare")
+    step = Next("compare slip models on your own logs", words)
+    emit(json, found, lambda page: show_benchmark(page, found), [step], out, files)
     every = [
         row
         for one in found["sets"].values()
@@ -74,4 +87,5 @@ def paper(
 
     for path in run(data, out):
         typer.echo(str(path))
+    suggest([Next("compare it with other systems", ("benchmark", "--data", data))])
     return 0

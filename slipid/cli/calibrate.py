@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Quiet, can_draw, emit, flag, guarded, option
+from slipid.cli.common import Json, Next, Quiet, can_draw, emit, flag, guarded, option
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -198,7 +198,8 @@ def _uncalibrated(
         raise DataError(f"--turn {turn:g}; expected an angle in degrees")
     camera = straight_camera(picture, per_pixel, height, turn, size_std)
     camera.save(out)
-    emit(json, camera.to_json(), lambda page: _show(page, camera.report), out.parent, [out.name])
+    content, following = camera.to_json(), _following(out)
+    emit(json, content, lambda page: _show(page, camera.report), following, out.parent, [out.name])
     return 0
 
 
@@ -219,8 +220,15 @@ def _write(
             files.append(floor_picture(fit, out.with_name(f"{out.stem}_floor.png")))
     content = read_json(out, "the camera file that was just written")
     about, fresh, names = content["report"], lens.quality is not None, [f.name for f in files]
-    emit(json, content, lambda page: _show(page, about, fresh), out.parent, names)
+    following = _following(out) if fit is not None else []
+    emit(json, content, lambda page: _show(page, about, fresh), following, out.parent, names)
     return 1 if about.get("poor") else 0
+
+
+def _following(camera: Path) -> list[Next]:
+    """Return the commands to suggest after the pose of a camera was calibrated."""
+    words = ("track", "run.mp4", "--camera", camera, "--out", "logs/run.poses.csv")
+    return [Next("find the poses of a marker on the robot in a video", words)]
 
 
 def _show(page: "Page", report: Content, lens_too: bool = True) -> None:

@@ -3,7 +3,17 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slipid.cli.common import ConfigFile, DataFolder, Json, MaybeOut, Quiet, can_draw, emit, guarded
+from slipid.cli.common import (
+    ConfigFile,
+    DataFolder,
+    Json,
+    MaybeOut,
+    Next,
+    Quiet,
+    can_draw,
+    emit,
+    guarded,
+)
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -24,7 +34,7 @@ def check(
     """
     from slipid.app import check as checks
     from slipid.app.config import BenchMotors, read_config
-    from slipid.report.estimates import show_check
+    from slipid.report.checks import show_check
 
     wanted = read_config(config)
     if isinstance(wanted.content.robot, BenchMotors):
@@ -44,14 +54,20 @@ def check(
                 from slipid.plots.fit import raw_plots
 
                 written += tuple(path.name for path in raw_plots(logs, out))
-    emit(json, found, lambda page: show_check(page, found), out, written)
-    return 1 if any(f["severity"] == "wrong" for f in found["findings"]) else 0
+    wrong = any(f["severity"] == "wrong" for f in found["findings"])
+    if wrong:
+        step = Next(f"after correcting {config} or the logs", ("check", config, "--data", data))
+    else:
+        words = ("identify", config, "--data", data, "--out", Path("out") / config.stem)
+        step = Next("fit the robot to these logs", words)
+    emit(json, found, lambda page: show_check(page, found), [step], out, written)
+    return 1 if wrong else 0
 
 
 def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:
     """Check the logs of motors on a bench, print the result, and return the exit code."""
     from slipid.app.bench import check_bench
-    from slipid.report.estimates import show_bench_check
+    from slipid.report.checks import show_bench_check
 
     written: tuple[str, ...] = ()
     with Reporter(quiet=quiet) as report:
@@ -68,5 +84,7 @@ def bench(config: "Config", data: Path, out: Path | None, json: str | None, quie
                 from slipid.plots.bench import bench_plots
 
                 written += tuple(path.name for path in bench_plots(fit, out))
-    emit(json, found, lambda page: show_bench_check(page, found), out, written)
+    words = ("identify", config.path, "--data", data, "--out", Path("out") / config.path.stem)
+    step = Next("fit the motors to these logs", words)
+    emit(json, found, lambda page: show_bench_check(page, found), [step], out, written)
     return 0

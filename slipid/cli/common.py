@@ -2,10 +2,13 @@
 
 import functools
 import os
+import shlex
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ParamSpec
+from textwrap import wrap
+from typing import TYPE_CHECKING, Annotated, NamedTuple, ParamSpec
 
 import typer
 from typer.models import OptionInfo
@@ -64,6 +67,8 @@ Json = Annotated[
 ]
 Quiet = Annotated[bool, flag("--quiet", "Print no progress.")]
 Words = ParamSpec("Words")
+FIRST = ("report.html", "benchmark.html", "paths.png", "validation_paths.png")
+"""Names of files at which to look first, the best one first."""
 
 
 def executor_of(jobs: int | None) -> "Executor":
@@ -155,10 +160,28 @@ def is_bench(path: Path) -> bool:
     return isinstance(robot, dict) and robot.get("drive") == "motor"
 
 
+class Next(NamedTuple):
+    """A command that is suggested at the end of another one.
+
+    Attributes:
+        purpose: what it is for, as an imperative.
+        words: its name, arguments and options.
+    """
+
+    purpose: str
+    words: tuple[object, ...]
+
+
+def renew(out: Path) -> Next:
+    """Return the suggestion to write the page of a result folder again."""
+    return Next("see it on the page, with all other results", ("report", out))
+
+
 def emit(
     json: str | None,
     content: object,
     show: Callable[["Page"], None],
+    following: Sequence[Next],
     out: Path | None = None,
     written: Sequence[str] = (),
 ) -> None:
@@ -169,6 +192,7 @@ def emit(
             no JSON.
         content: content of the JSON.
         show: function that prints the result as text.
+        following: commands to suggest.
         out: folder to which the command wrote files, or None.
         written: names of these files, to be printed.
     """
@@ -180,7 +204,37 @@ def emit(
         return
     if json is not None:
         write_json(Path(json), content)
-    page = Page()
+    data = [str(out / name) for name in written if name.endswith(".json")] if out else []
+    page = Page(rest=data[0] if data else json or "the file of --json FILE")
     show(page)
+    page.end()
     if out is not None:
-        page.line(f"in {out}: {', '.join(written)}")
+        _show_files(page, out, written)
+    suggest(following)
+
+
+def _show_files(page: "Page", out: Path, written: Sequence[str]) -> None:
+    """Print where to look first among files that a command wrote, and the names of the others."""
+    pictures = [name for name in written if name.endswith((".html", ".png"))]
+    order = [name for name in FIRST if name in pictures] or pictures
+    first = order[0] if order else written[0]
+    page.line(f"in {out}: {'look first at ' if order else ''}{first}")
+    others = ", ".join(name for name in written if name != first)
+    for line in wrap(others, 76):
+        page.line(f"  {line}")
+
+
+def suggest(following: Sequence[Next]) -> None:
+    """Print commands to type next."""
+    for purpose, words in following:
+        typer.echo(f"next, {purpose}:\n  {program()} {shlex.join(map(str, words))}")
+
+
+def program() -> str:
+    """Return how slipid was called, so that a suggested command can be typed in the same place."""
+    called = Path(sys.argv[0])
+    if called.parts[-2:] == ("slipid", "__main__.py"):
+        return "python -m slipid"
+    found = shutil.which("slipid")
+    known = found is not None and called.exists() and Path(found).samefile(called)
+    return shlex.quote(sys.argv[0]) if called.name == "slipid" and not known else "slipid"

@@ -1,19 +1,23 @@
 """`slipid demo`: identify a robot from logs of the virtual test site, and show the true values."""
 
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Out, Quiet, executor_of, guarded, option
+from slipid.cli.common import Next, Out, Quiet, emit, executor_of, guarded, option
 from slipid.support.content import Content
 from slipid.support.errors import DataError
+from slipid.support.extras import MissingExtra
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from slipid.app.identify import IdentifyResult
+    from slipid.report.page import Page
 
 PARTS = ("fit", "unseen")
 """Names of the folders of fitted runs and of predicted runs.
@@ -36,19 +40,18 @@ def demo(
     """Identify a robot from small logs of the virtual test site; write all results to a folder."""
     with Reporter(quiet=quiet) as report, executor_of(None) as executor:
         done, found, truth = run(out, plant, seed, executor, report)
-    from slipid.report.estimates import show_truth, show_validation
-    from slipid.report.page import Page
+    from slipid.report.answers import show_validation
+    from slipid.report.calibration import show_trust
+    from slipid.report.estimates import show_truth
 
-    page, result = Page(), out / "result"
-    show_truth(page, done.fit, truth)
-    page.line("open-loop predictions of runs that were not fitted:")
-    show_validation(page, found)
-    pictures = [name for name in done.written if name.endswith(".png")]
-    pictures += sorted(path.name for path in result.glob("validation_*.png"))
-    first = result / next(iter(done.written))
-    page.line(f"\nlook at: {first}")
-    page.line(f"pictures in {result}: {', '.join(pictures)}")
-    page.line(f"values: {result / 'identified.json'}, {result / 'validation.json'}")
+    def show(page: "Page") -> None:
+        show_truth(page, done.fit, truth)
+        show_validation(page, found)
+        page.line()
+        show_trust(page, done.fit.trust)
+
+    step = Next("a config for your own robot, from its logs", ("new", "--from", "logs"))
+    emit(None, None, show, [step], out / "result", done.written)
     return 0 if done.fit.converged else 1
 
 
@@ -88,9 +91,11 @@ def run(
     result = out / "result"
     logs = source / "fit" / "logs"
     done = identify(checked_task(out / "robotino.toml", logs, report), logs, result, report)
-    found = validate(result, source / "unseen" / "logs", report)
+    found, written = validate(result, source / "unseen" / "logs", report)
     report.stage("writing the page")
-    write_report(result)
+    with suppress(MissingExtra):  # `identify` has named it
+        write_report(result)
+    done = replace(done, written=(*done.written, *written))
     truth = read_json(
         source / "fit/truth/truth.json", "the true values that `slipid simulate` wrote"
     )

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, can_draw, emit, for_robots, option
+from slipid.cli.common import Json, Next, OutFolder, Quiet, can_draw, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -75,7 +75,9 @@ def design(
         scope = Scope(fit, *goals, runs, headings, speeds, turns, distance, *places)
         found = proposal.design(scope)
         written = write(found, out, report)
-    emit(json, found.content, lambda page: show_design(page, found.content), out, written)
+    words = ("identify", out / "config.toml", "--data", "logs", "--out", f"{out}_again")
+    step = Next("after driving them, with the old and the new logs in a folder logs", words)
+    emit(json, found.content, lambda page: show_design(page, found.content), [step], out, written)
     return 0 if found.reachable else 1
 
 

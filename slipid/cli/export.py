@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, Load, Quiet, emit, flag, for_robots, option
+from slipid.cli.common import Json, Load, Next, Quiet, emit, flag, for_robots, option
 from slipid.support.progress import Reporter
 
 
@@ -73,7 +73,8 @@ def export(
 
             load_program(source / "stablehlo")
         found = {"folder": str(source), "files": list(names), "intact": True}
-        emit(json, found, lambda page: page.line(f"{source}: all {len(names)} files are unchanged"))
+        intact = f"{source}: all {len(names)} files are unchanged"
+        emit(json, found, lambda page: page.line(intact), [])
         return 0
     if out is None:
         raise DataError("--out is missing; expected a folder to write to")
@@ -83,7 +84,9 @@ def export(
         options = ExportOptions(_names(to), controller, path, speed, map, recovery)
         done = run(robot, out, options, report, ROWS)
     content = {"schema": "slipid.export/1", **asdict(done), "folder": str(done.folder)}
-    emit(json, content, lambda page: show_export(page, done))
+    written = ["README.md", "robot.json", *(f"{form}/" for form in done.forms)]
+    step = Next("on the robot, check that every file arrived", ("export", out, "--check"))
+    emit(json, content, lambda page: show_export(page, done), [step], out, written)
     return 0
 
 

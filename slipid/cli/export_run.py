@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option, renew
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -69,7 +69,14 @@ def export_run(
         },
         "notes": list(view.notes),
     }
-    emit(json, content, lambda page: show(page, file.topics, view.notes), out.parent, [out.name])
+    emit(
+        json,
+        content,
+        lambda page: show(page, file.topics, view.notes),
+        [renew(fitted)],
+        out.parent,
+        [out.name],
+    )
     return 0
 
 
@@ -81,4 +88,5 @@ def show(page: "Page", topics: "tuple[McapTopic, ...]", notes: tuple[str, ...]) 
     for one in topics:
         rows.add_row(one.name, one.schema, one.unit, str(one.messages))
     page.table(rows)
+    page.line("open the file in Foxglove, or by: rerun FILE")
     page.notes(notes)

@@ -3,7 +3,17 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, for_robots, option
+from slipid.cli.common import (
+    DataFolder,
+    Json,
+    Next,
+    Out,
+    OutFolder,
+    Quiet,
+    emit,
+    for_robots,
+    option,
+)
 from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
@@ -41,7 +51,11 @@ def floors(
         lookup, runs = floors_under(fitted, map, data, logs, report)
         written = write_floors(out, lookup, runs)
     content = summary(lookup, runs)
-    emit(json, content, lambda page: show(page, content), out, [f"{len(written)} CSV files"])
+    step = Next(
+        "try the controllers on this floor", ("trial", fitted, "--plant", "twin", "--map", map)
+    )
+    files = [f"{len(written)} CSV files"]
+    emit(json, content, lambda page: show(page, content), [step], out, files)
     return 0 if content["beyond_the_map"] <= MOST_BEYOND else 1
 
 
@@ -53,5 +67,5 @@ def show(page: "Page", content: Content) -> None:
     for name, run in content["runs"].items():
         shares.add_row(name, *(" ".join(f"{100 * v:3.0f}" for v in row) for row in run.values()))
     page.table(shares)
-    if beyond := content["beyond_the_map"]:
-        page.line(f"note: {100 * beyond:.1f} % of the wheel positions are outside the map")
+    beyond = content["beyond_the_map"]
+    page.line(f"{100 * beyond:.1f} % of the wheel positions are outside the map")

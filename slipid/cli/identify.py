@@ -9,6 +9,7 @@ from slipid.cli.common import (
     ConfigFile,
     DataFolder,
     Json,
+    Next,
     Out,
     Quiet,
     can_draw,
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from slipid.app.identify import IdentifyResult
     from slipid.app.problem import ConfigFitTask
     from slipid.report.page import Page
+
+
+PRIORS = Next('use it as priors of a robot, by [robot] motor = "FILE" in its config', ("new",))
 
 
 @guarded
@@ -51,12 +55,13 @@ def identify(
 
     Writes report.html, a page to look at, identified.json, fit.json, robot.json and pictures. An
     interrupted fit is continued. The exit code is 1 if the selected models are not to be trusted:
-    on held-out runs, a simpler model
-    predicts better, or a selected force balance did not converge or is not plausible.
+    on held-out runs, a simpler model predicts better, or a selected force balance did not converge
+    or is not plausible.
     """
     from slipid.app.config import BenchMotors, read_config
     from slipid.app.identify import IdentifyResult, checked_task
-    from slipid.report.estimates import show_calibration, show_fit, show_trust
+    from slipid.report.calibration import show_calibration, show_trust
+    from slipid.report.estimates import show_fit
     from slipid.support.files import read_json
 
     wanted = read_config(config)
@@ -85,7 +90,17 @@ def identify(
             show_calibration(page, done.calibration)
         show_trust(page, done.trust)
 
-    emit(json, content, show, out, done.written)
+    if done.trust.is_bad:
+        following = [Next("look for mistakes in the logs", ("check", config, "--data", data))]
+    else:
+        following = [
+            Next(
+                "predict runs that were not fitted, here in a folder other",
+                ("validate", out, "--data", "other"),
+            ),
+            Next("take it to the robot", ("export", out, "--out", out / "to_go")),
+        ]
+    emit(json, content, show, following, out, done.written)
     return 1 if done.trust.is_bad else 0
 
 
@@ -168,5 +183,5 @@ def bench(
             written = (*written, *(path.name for path in bench_plots(fit, out)))
         page = bench_page(fit, config.path.name)
         written = (*try_page(page, out / REPORT, report), *written)
-    emit(json, fit.to_json(), lambda page: show_bench(page, fit), out, written)
+    emit(json, fit.to_json(), lambda page: show_bench(page, fit), [PRIORS], out, written)
     return 0 if fit.good else 1

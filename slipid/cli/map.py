@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Out, Quiet, can_draw, emit, guarded, option
+from slipid.cli.common import Json, Next, Out, Quiet, can_draw, emit, guarded, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -79,12 +79,21 @@ def map_(
         if result.proposal is not None:
             write_bytes(out / PROPOSAL, result.proposal.encode())
             written.append(PROPOSAL)
-    emit(json, result.to_json(), lambda page: show(page, result, out), out, written)
+    step = Next(
+        "find the floor under each wheel in logged runs",
+        ("floors", "out/robot", "--map", out / "map.geojson", "--data", "logs", "--out", "under"),
+    )
+    if result.proposal is not None:
+        step = Next(
+            f"after renaming or merging the proposed surfaces in {out / PROPOSAL}",
+            ("map", image, "--camera", camera, "--out", out, "--config", out / PROPOSAL),
+        )
+    emit(json, result.to_json(), lambda page: show(page, result), [step], out, written)
     return 1 if result.poor else 0
 
 
-def show(page: "Page", result: "PictureMap", out: Path) -> None:
-    """Print the surfaces of a map, its warnings, and the next step."""
+def show(page: "Page", result: "PictureMap") -> None:
+    """Print the surfaces of a map, and its warnings."""
     from slipid.report.page import table
 
     content = result.to_json()
@@ -108,9 +117,3 @@ def show(page: "Page", result: "PictureMap", out: Path) -> None:
         page.line(f"warning: {sentence}")
     for sentence in result.poor:
         page.line(f"poor: {sentence}")
-    if result.proposal is not None:
-        page.line(
-            f"these surfaces are a proposal: rename or merge them in {out / PROPOSAL}, then run "
-            "the same command with"
-        )
-        page.line(f"  --config {out / PROPOSAL}")

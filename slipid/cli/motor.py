@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from slipid.cli.common import Json, MaybeOut, Quiet, can_draw, emit, flag, guarded, option
+from slipid.cli.identify import PRIORS
 from slipid.support.progress import Reporter
 
 Column = str | None
@@ -82,8 +83,8 @@ def motor(
                 from slipid.plots.bench import bench_plots
 
                 written += [path.name for path in bench_plots(fit, out)]
-            written[:0] = try_page(
-                bench_page(fit, file.name, task.columns_used), out / REPORT, report
-            )
-    emit(json, content, lambda page: show_bench(page, fit, task.columns_used), out, written)
+            page = bench_page(fit, file.name, task.columns_used)
+            written[:0] = try_page(page, out / REPORT, report)
+    used = task.columns_used
+    emit(json, content, lambda page: show_bench(page, fit, used), [PRIORS], out, written)
     return 0 if fit.good else 1

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import flag, guarded, option
+from slipid.cli.common import Next, flag, guarded, option, suggest
 
 if TYPE_CHECKING:
     from slipid.app.new.config_text import NewConfig
@@ -146,13 +146,14 @@ def _show(config: "NewConfig", out: Path, data: str) -> None:
         typer.echo(f'{out} has open questions, lines that begin with "# ?":')
         for question in config.questions:
             typer.echo(f"  ? {question}")
-        typer.echo("answer them, then run")
     else:
-        typer.echo(f"{out} is complete; run")
-    typer.echo(f"  slipid check {out} --data {data}")
+        typer.echo(f"{out} is complete")
+    purpose = "after answering them, check the logs" if config.questions else "check the logs"
+    following = [Next(purpose, ("check", out, "--data", data))]
     if config.simulated:
-        typer.echo("or, before driving, simulate which parameters a plan of runs would identify:")
-        typer.echo(f"  slipid selftest {out}")
+        plan = "or, before driving, simulate which parameters a plan of runs would identify"
+        following.append(Next(plan, ("selftest", out)))
+    suggest(following)
 
 
 @guarded

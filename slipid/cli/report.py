@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import OutFolder, Quiet, for_robots, option
+from slipid.cli.common import Next, OutFolder, Quiet, for_robots, option, suggest
 from slipid.support.progress import Reporter
 
 
@@ -27,4 +27,5 @@ def report(
     with Reporter(quiet=quiet) as progress:
         path = renew(out, data, progress)
     typer.echo(f"look at: {path}")
+    suggest([Next("take it to the robot", ("export", out, "--out", out / "to_go"))])
     return 0

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, emit, guarded
+from slipid.cli.common import Json, Next, emit, guarded
 
 
 @guarded
@@ -20,9 +20,14 @@ def robots(
 
     if name is not None:
         one = reference_robot(name)
-        emit(json, one.to_json(), lambda page: show_robot(page, one))
+        step = Next("a config that starts from its numbers", ("new", "--robot", name))
+        emit(json, one.to_json(), lambda page: show_robot(page, one), [step])
         return 0
     every = reference_robots()
     content = {"schema": "slipid.references/1", "robots": [one.to_json() for one in every]}
-    emit(json, content, lambda page: show_robots(page, every))
+    following = [
+        Next("all numbers of one", ("robots", every[0].name)),
+        Next("a config that starts from its numbers", ("new", "--robot", every[0].name)),
+    ]
+    emit(json, content, lambda page: show_robots(page, every), following)
     return 0

@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, can_draw, emit, for_robots, option
+from slipid.cli.common import (
+    Json,
+    Next,
+    OutFolder,
+    Quiet,
+    can_draw,
+    emit,
+    for_robots,
+    option,
+    renew,
+)
 from slipid.support.progress import Reporter
 
 
@@ -53,5 +63,9 @@ def sample(
             written += [path.name for path in posterior_plots(posterior, out)]
     content = read_json(out / "identified.json", "a result of `slipid sample`")
     shown = posterior.parameters.values(), about, content["messages"]
-    emit(json, content, lambda page: show_sample(page, *shown), out, written)
+    following = [renew(out)]
+    if not posterior.converged:
+        words = ("sample", out, "--most", 2 * most)
+        following = [Next("continue until it converges", words)]
+    emit(json, content, lambda page: show_sample(page, *shown), following, out, written)
     return 0 if posterior.converged else 1

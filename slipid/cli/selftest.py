@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, for_robots, option
+from slipid.cli.common import ConfigFile, Json, Next, Out, Quiet, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 
@@ -28,10 +28,13 @@ def selftest(
     be recovered is not.
     """
     from slipid.lab.selftest.experiment import selftest as run
-    from slipid.report.estimates import show_selftest
+    from slipid.report.checks import show_selftest
 
     with Reporter(quiet=quiet) as report:
         found = run(config, data, out, replicates, seed, report)
     files = ("selftest.json", "replicates.json")
-    emit(json, found, lambda page: show_selftest(page, found), out, files)
+    step = Next("drive it, and check the logs", ("check", config, "--data", data or "logs"))
+    if not found["recovered"]:
+        step = Next(f"after planning more runs in {config}", ("selftest", config, "--out", out))
+    emit(json, found, lambda page: show_selftest(page, found), [step], out, files)
     return 0 if found["recovered"] else 1

@@ -1,9 +1,10 @@
 """`slipid simulate`: simulate runs on the virtual test site, and write their logs."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, executor_of, guarded
+from slipid.cli.common import ConfigFile, Jobs, Json, Next, Out, Quiet, emit, executor_of, guarded
 from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
@@ -28,22 +29,26 @@ def simulate(
     plan = read(config, text_of(config))
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
         found = run(plan, out, executor, report)
-    emit(json, found, lambda page: show(page, found, plan, out))
+    emit(json, found, lambda page: show(page, found, out), list(following(plan, out)))
     return 0
 
 
-def show(page: "Page", found: Content, plan: "SimulationPlan", out: Path) -> None:
-    """Print the number and duration of the simulated runs, and the next commands."""
-    from slipid.lab.testsite.config import can_identify
-
+def show(page: "Page", found: Content, out: Path) -> None:
+    """Print the number and duration of the simulated runs."""
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them simulated now")
     if found["pace"] is not None:
         page.line(f"{found['seconds']:.0f} s at {found['pace']:.1f} times real time")
     page.line(f"true values, which no fit reads: {out / 'truth'}")
+
+
+def following(plan: "SimulationPlan", out: Path) -> Iterator[Next]:
+    """Yield the commands to suggest after a simulation."""
+    from slipid.lab.testsite.config import can_identify
+
     if can_identify(plan):
-        page.line(
-            f"  slipid identify {out / 'robot.toml'} --data {out / 'logs'} --out {out / 'result'}"
-        )
+        words = ("identify", out / "robot.toml", "--data", out / "logs", "--out", out / "result")
+        yield Next("fit the robot to its logs", words)
     if "robotino2022" in plan.content.formats:
-        data, result = out / "robotino2022", out / "result2022"
-        page.line(f"  slipid identify configs/robotino2022.toml --data {data} --out {result}")
+        config, data = Path("configs/robotino2022.toml"), out / "robotino2022"
+        words = ("identify", config, "--data", data, "--out", out / "result2022")
+        yield Next("fit it to its logs in the format of the 2022 data set", words)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Quiet, emit, guarded, option
+from slipid.cli.common import Json, Next, Quiet, emit, guarded, option
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -112,7 +112,10 @@ def track(
         for doubt in result.doubts:
             page.line(f"DOUBTFUL: {doubt}")
 
-    emit(json, result.to_json(), show, out.parent, written)
+    step = Next(
+        "write a config, from the poses and the robot's logs", ("new", "--from", out.parent)
+    )
+    emit(json, result.to_json(), show, [step], out.parent, written)
     return 1 if result.doubts else 0
 
 

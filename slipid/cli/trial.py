@@ -16,6 +16,7 @@ from slipid.cli.common import (
     executor_of,
     for_robots,
     option,
+    renew,
 )
 from slipid.support.progress import Reporter
 
@@ -85,9 +86,11 @@ def trial(
     )
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
         done = run(out, options, executor, report)
+        written = ["trial.json"]
         if can_draw(report):
             from slipid.lab.trial.plots import trial_plot
 
-            trial_plot(done, out / "trial.png")
-    emit(json, done.content, lambda page: show_trial(page, done.content, out))
+            written.append(trial_plot(done, out / "trial.png").name)
+    found = done.content
+    emit(json, found, lambda page: show_trial(page, found), [renew(out)], out, written)
     return 0

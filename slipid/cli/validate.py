@@ -7,6 +7,7 @@ from slipid.cli.common import (
     ConfigFile,
     DataFolder,
     Json,
+    Next,
     Out,
     OutFolder,
     Quiet,
@@ -14,6 +15,7 @@ from slipid.cli.common import (
     emit,
     for_robots,
     option,
+    renew,
 )
 from slipid.support.content import Content
 from slipid.support.progress import Reporter
@@ -41,16 +43,18 @@ def validate(
 
     Writes validation.json and pictures to OUT.
     """
-    from slipid.report.estimates import show_validation
+    from slipid.report.answers import show_validation
 
     with Reporter(quiet=quiet) as report:
-        found = run(out, data, report, logs)
-    emit(json, found, lambda page: show_validation(page, found))
+        found, written = run(out, data, report, logs)
+    emit(json, found, lambda page: show_validation(page, found), [renew(out)], out, written)
     return 0
 
 
-def run(out: Path, data: Path, report: Reporter, logs: str | None = None) -> Content:
-    """Return the content of validation.json, and write it with pictures to the result folder.
+def run(
+    out: Path, data: Path, report: Reporter, logs: str | None = None
+) -> tuple[Content, list[str]]:
+    """Return the content of validation.json, and the names of the files written to `out`.
 
     Arguments are those of `slipid.app.compare.validate`.
     """
@@ -61,16 +65,16 @@ def run(out: Path, data: Path, report: Reporter, logs: str | None = None) -> Con
     if (out / IDENTIFIED).exists() and not (out / FIT).exists():
         content = validate_calibration(out, data, report, logs).to_json()
         write_json(out / VALIDATION, content)
-        return content
+        return content, [VALIDATION]
     fit, dataset, found = validate(out, data, report, logs)
     content = found.to_json()
     write_json(out / VALIDATION, content)
+    written = [VALIDATION]
     if can_draw(report):
         from slipid.plots.fit import validate_plots
 
-        drawn = validate_plots(fit, dataset, found, out)
-        report.line(f"in {out}: {VALIDATION}, {', '.join(path.name for path in drawn)}")
-    return content
+        written += [path.name for path in validate_plots(fit, dataset, found, out)]
+    return content, written
 
 
 @for_robots
@@ -99,6 +103,7 @@ def compare(
             from slipid.plots.compare import compare_plot
 
             written.append(compare_plot(found, out).name)
-        report.line(f"written to {out}: {', '.join(written)}")
-    emit(json, found, lambda page: show_comparison(page, found))
+    words = ("identify", config, "--data", data, "--out", Path("out") / config.stem)
+    step = Next("fit the robot, with the best of three models on every floor", words)
+    emit(json, found, lambda page: show_comparison(page, found), [step], out, written)
     return 0 if all(q["converged"] for q in found["questions"].values()) else 1

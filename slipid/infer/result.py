@@ -385,8 +385,10 @@ class Fit:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Warnings about the fit and its parameters, one sentence each."""
-        found = [*sentences(self.flat)]
+        """Warnings about the fit and its parameters, one sentence each, the gravest first."""
+        found = [] if self.converged else [f"the fit did not converge: {self.reason}"]
+        if self.refused is not None:
+            found.append(str(self.refused["reason"]))
         found += [
             f"the wheel loads estimated on {one} and on {other} differ by {sigma:.1f} standard "
             "errors of their noise: the contact law is incomplete; the intervals include this "
@@ -404,11 +406,7 @@ class Fit:
             for e in self.parameters.values()
             if e.pull is not None and abs(e.pull) > CONFLICT_STDS and e.verdict != "at_bound"
         ]
-        if self.refused is not None:
-            found.append(str(self.refused["reason"]))
-        if not self.converged:
-            found.append(f"the fit did not converge: {self.reason}")
-        return tuple(found)
+        return (*found, *sentences(self.flat))
 
     @property
     def data_hash(self) -> str:

@@ -97,7 +97,7 @@ class Validation:
     new: int = 0
 
     def __str__(self) -> str:
-        from slipid.report.estimates import show_validation
+        from slipid.report.answers import show_validation
         from slipid.report.page import text_of
 
         return text_of(show_validation, self.to_json())

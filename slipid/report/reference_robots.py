@@ -31,8 +31,7 @@ def show_robots(page: Page, robots: Sequence[ReferenceRobot]) -> None:
             page.line(f"{one.name}: {one.about}")
     page.line(
         f"{len(driven)} robots and {len(robots) - len(driven)} set of motors, identified from "
-        "public logs.\n"
-        "slipid robots NAME shows one; slipid new --robot NAME starts a config from it."
+        "public logs"
     )
 
 

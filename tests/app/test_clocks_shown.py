@@ -8,7 +8,7 @@ import pytest
 
 from slipid.app.check import _clock
 from slipid.data.align.clock import Clock
-from slipid.report.estimates import show_check
+from slipid.report.checks import show_check
 from slipid.report.page import Page
 
 CLOCK = Clock(

@@ -11,7 +11,7 @@ import pytest
 from slipid.app.check import overview
 from slipid.app.config import geometry, given_settings, read_config
 from slipid.app.problem import read_fit_task
-from slipid.report.estimates import show_check
+from slipid.report.checks import show_check
 from slipid.report.page import text_of
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import generic_text, robotino_text, write_good

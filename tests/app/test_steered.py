@@ -164,7 +164,7 @@ def test_identify_calibrates_alone_and_says_so(car, tmp_path):
     done = invoke("identify", car / "robot.toml", "--data", car / "logs", "--out", out)
     assert done.exit_code == 0, done.stderr
     assert "no force balance for steered wheels" in done.stderr
-    assert "asphalt: effective wheelbase" in done.stdout
+    assert "\n  effective wheelbase " in done.stdout.split("\nasphalt ")[1]
     content = json.loads((out / "identified.json").read_text(encoding="utf-8"))
     assert any("no force balance for steered wheels" in text for text in content["messages"])
     assert content["selected_model"] == {"asphalt": "calibrated"}

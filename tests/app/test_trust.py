@@ -60,7 +60,9 @@ def test_a_fit_that_predicts_worse_than_a_simpler_model_ends_with_exit_code_1(
 ):
     folder, _ = small
     good = Fit.load(folder / "out")
-    worse = FloorSelection("contact", {"nominal": 0.0234, "contact": 0.0345}, {}, 6, True)
+    errors = {"nominal": 0.0234, "contact": 0.0345}
+    behind = dict.fromkeys(errors, (0.0, 0.001))
+    worse = FloorSelection("contact", errors, behind, 6, True)
     fit = replace(good, selection=dict.fromkeys(good.selection, worse))
     monkeypatch.setattr(identify, "fitted", lambda *_: (fit, None, None))
     logs, out = folder / "logs", tmp_path / "out"

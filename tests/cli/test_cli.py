@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import shlex
 import shutil
 import signal
 import stat
@@ -15,9 +17,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 from slipid.app.config import read_config, single_floor_sections
 from slipid.app.logs import matching_files, packaged_config, packaged_path
+from slipid.cli.main import app
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
@@ -90,6 +94,20 @@ def test_validate_without_a_fit_is_2(tmp_path):
     result = invoke("validate", tmp_path, "--data", tmp_path)
     assert result.exit_code == 2
     assert "expected the result of `slipid identify`" in result.stderr
+
+
+def suggested(text: str) -> list[list[str]]:
+    """Commands that a command suggested at its end, each checked as if it was typed."""
+    lines = text.splitlines()
+    typed = [
+        shlex.split(after)[1:]
+        for line, after in itertools.pairwise(lines)
+        if line.startswith("next, ")
+    ]
+    for name, *words in typed:
+        with typer.main.get_command(app).commands[name].make_context(name, words):
+            pass
+    return typed
 
 
 # broken logs ------------------------------------------------------------------------------------
@@ -210,7 +228,8 @@ def test_identify_writes_the_files_of_the_contract(small):
     found = json.loads((out / "identified.json").read_text(), parse_constant=pytest.fail)
     assert found["data"]["hash"] == run["data"]["hash"]
     assert json.loads((out / "fit.json").read_text(), parse_constant=pytest.fail)["converged"]
-    assert "motor.resistance" in result.stdout
+    assert ".resistance" in result.stdout
+    assert f"in {out}: look first at report.html" in result.stdout
     assert "skipped" in result.stderr  # the config also names moved/
 
 
@@ -251,6 +270,21 @@ def test_a_profile_of_what_is_not_fitted_is_2_before_the_fit(small, tmp_path):
     assert result.exit_code == 2
     assert "--profile: robot.mass is fixed; expected one of the free scalars" in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_commands_suggest_what_to_type_next(small, sampled):
+    folder, result = small
+    out = str(folder / "out")
+    assert suggested(result.stdout) == [
+        ["validate", out, "--data", "other"],
+        ["export", out, "--out", f"{out}/to_go"],
+    ]
+    [[name, *words]] = suggested(sampled[1].stdout)
+    assert (name, words[1:]) == ("sample", ["--most", "80"])
+    check = invoke("check", folder / "my.toml", "--data", folder / "logs")
+    [[name, *words]] = suggested(check.stdout)
+    assert (name, words[-1]) == ("identify", "out/my")
 
 
 @pytest.mark.slow

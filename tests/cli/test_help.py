@@ -37,7 +37,7 @@ def test_the_help_lists_every_command_in_a_panel_on_one_line():
     for line in lines:
         if line.endswith(":") and line[0] != " ":
             panels[line[:-1]] = found = []
-        elif match := re.match("  ([a-z]+) +[A-Z][a-z]", line):
+        elif match := re.match("  ([a-z][a-z-]*) +[A-Z][a-z0-9]", line):
             found.append(match[1])
     assert list(panels) == [*PANELS, "Options"]
     assert [name for found in panels.values() for name in found] == NAMES

@@ -287,7 +287,7 @@ def test_check_lists_the_logs_and_their_ranges(bench):
     result = invoke("check", bench / "bench.toml", "--data", bench / "two", "--quiet")
     assert result.exit_code == 0
     assert "both.csv" in result.output
-    assert "motor.resistance@right" in result.output
+    assert ".resistance@right" in result.output
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ def test_a_log_is_looked_into(tmp_path):
     out = tmp_path / "mine.toml"
     result = invoke("new", "--from", tmp_path / "logs", "--out", out, *DIFFERENTIAL)
     assert result.exit_code == 0, result.stderr
-    assert f"{out} is complete; run" in result.stdout
+    assert f"{out} is complete\n" in result.stdout
     assert f"slipid check {out} --data {tmp_path / 'logs'}" in result.stdout
     result = invoke("new", "--from", tmp_path / "logs", "--out", out, "--force")
     assert result.exit_code == 0, result.stderr

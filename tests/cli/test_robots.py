@@ -29,8 +29,8 @@ def test_every_robot_and_floor_is_listed():
     for model in ("nominal", "calibrated", "selected"):
         assert f"{100 * floor.error_over_path[model]:.2f} %" in husky
     assert husky.split()[1:3] == ["skid", "wet_grass"]
-    assert said[-2] == "4 robots and 1 set of motors, identified from public logs."
-    assert "slipid new --robot NAME" in said[-1]
+    assert "4 robots and 1 set of motors, identified from public logs" in said
+    assert said[-1].endswith("slipid new --robot husky")
 
 
 @pytest.mark.parametrize("name", reference_names())

@@ -128,7 +128,7 @@ def test_python_gives_the_numbers_of_the_command_line(calibrated):
     ):
         assert mine.value == pytest.approx(other["value"], rel=1e-4)
     assert found.trust.word == "trusted"
-    assert "floor: rolling radius left" in str(found)
+    assert "\nfloor\n  rolling radius left " in str(found)
     assert "verdict: trusted" in str(found)
     kept = DeployedRobot.load(out / "robot.json")
     np.testing.assert_allclose(found.deploy().kinematics, kept.kinematics, rtol=1e-4, atol=1e-9)

@@ -99,9 +99,9 @@ class Posterior:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Warnings about the fit and the convergence of its chains, one sentence each."""
+        """Warnings about the convergence of the chains and the fit, one sentence each."""
         warning = f"the posterior did not converge: {self.reason}"
-        return self.fit.messages + (() if self.converged else (warning,))
+        return (() if self.converged else (warning,)) + self.fit.messages
 
     def draws(self, path: str) -> Float[np.ndarray, "ensemble draw *number"]:
         """Return draws of a free parameter [SI], one row per ensemble, early steps first.

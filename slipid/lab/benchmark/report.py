@@ -25,8 +25,8 @@ COLUMNS: Mapping[str, tuple[str, float, int]] = {
 """Column heading, factor to the displayed unit and decimal places, by field of `RowSummary`."""
 WITH_INTERVALS = ("endpoint_error", "behind")
 """Fields that are shown with their 90 % intervals."""
-PAGE_ONLY = ("length_error", "twist_error")
-"""Fields that are shown only on the HTML page, as a terminal is too narrow for them."""
+BRIEF = ("endpoint_error", "behind", "coverage90")
+"""Fields that are shown as text; the HTML page has all of them."""
 
 
 def show_benchmark(page: terminal.Page, found: Content) -> None:
@@ -35,15 +35,15 @@ def show_benchmark(page: terminal.Page, found: Content) -> None:
         for protocol, rows in one["protocols"].items():
             about = found["protocols"][protocol]
             title = f"\n{name}: {about}; end points over the {one['over']}"
-            brief = [number for number in shown(rows) if number not in PAGE_ONLY]
-            head, body = methods(rows, brief, COSTS[1:])
+            brief = [number for number in shown(rows) if number in BRIEF]
+            head, body = methods(rows, brief, COSTS[1:2])
             made = terminal.table(head, title, right=head[1:])
             for row, *cells in body:
                 made.add_row(Cell(row), *cells)
-            for column in made.columns:
-                column.no_wrap = True
             page.table(made)
-            page.notes(absent(rows))
+            page.line(f"{len(body)} methods; {PAGE} has all their errors and costs")
+            for sentence in absent(rows):
+                page.line(sentence)
     for name, one in others(found):
         if one.failure:
             page.line(f"\n{name}: {one.failure}")
@@ -52,6 +52,7 @@ def show_benchmark(page: terminal.Page, found: Content) -> None:
         for of_row in one.body:
             made.add_row(*of_row)
         page.table(made)
+        page.line(f"{len(one.body)} rows, the best first")
     page.line()
     for sentence in found["reading"]:
         page.line(sentence)
@@ -68,14 +69,19 @@ def methods(
     Args:
         rows: rows of a protocol; those without results are omitted.
         numbers: fields of `COLUMNS` that become columns.
-        costs: trailing entries of `COSTS`, which become the last columns.
+        costs: entries of `COSTS`, which become the last columns.
     """
     there = [(name, one) for name, one in rows.items() if one["endpoint_error"] is not None]
     body = [
-        (name, *(in_words(n, one[n]) for n in numbers), *costs_of(one)[-len(costs) :])
+        (name, *(in_words(n, one[n]) for n in numbers), *_some(costs_of(one), costs))
         for name, one in sorted(there, key=lambda item: item[1]["endpoint_error"][0])
     ]
     return ("row", *(COLUMNS[n][0] for n in numbers), *costs), body
+
+
+def _some(cells: Sequence[str], costs: Sequence[str]) -> list[str]:
+    """Return the cells of some entries of `COSTS`."""
+    return [cells[COSTS.index(name)] for name in costs]
 
 
 def shown(rows: Content) -> list[str]:
