@@ -78,10 +78,10 @@ def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> Figu
             )
         )
     selected = data[-1]
-    own = [x for x, y in zip(selected["x"], selected["y"], strict=True) if y.startswith("this")]
+    mine = [x for x, y in zip(selected["x"], selected["y"], strict=True) if y.startswith("this")]
     least = [b.value for b in bands["selected"]]
     title = (
-        f"This robot is predicted within {min(own):.2g} to {max(own):.2g} % of the path, others "
+        f"This robot is predicted within {min(mine):.2g} to {max(mine):.2g} % of the path, others "
         f"within {100 * min(least):.2g} to {100 * max(least):.2g} %"
     )
     x = draw.axis("error on held-out runs [% of the path]")
