@@ -79,10 +79,9 @@ def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> Figu
         )
     selected = data[-1]
     mine = [x for x, y in zip(selected["x"], selected["y"], strict=True) if y.startswith("this")]
-    least = [b.value for b in bands["selected"]]
+    theirs = [100 * b.value for b in bands["selected"]]
     title = (
-        f"This robot is predicted within {min(mine):.2g} to {max(mine):.2g} % of the path, others "
-        f"within {100 * min(least):.2g} to {100 * max(least):.2g} %"
+        f"This robot is predicted within {_span(mine)} of the path, others within {_span(theirs)}"
     )
     x = draw.axis("error on held-out runs [% of the path]")
     x |= {"type": "log"} if is_wide(every) else {"rangemode": "tozero"}
@@ -91,6 +90,12 @@ def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> Figu
     alt = f"{title}. Dots show the errors of three models on every floor of every robot."
     rows_shown = len(set(selected["y"]))
     return FigureBlock("others", title, alt, data, layout, "", 140 + 26 * rows_shown, minimum=460)
+
+
+def _span(percent: Sequence[float]) -> str:
+    """Return the smallest and the largest of some percentages as text."""
+    low, high = f"{min(percent):.2g}", f"{max(percent):.2g}"
+    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _numbers(found: Results) -> TableBlock:

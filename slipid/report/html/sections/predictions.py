@@ -356,7 +356,7 @@ def _bias(q: Quarters, column: str, text: str, runs: Sequence[RunEvidence]) -> s
     under = np.array([runs[r].floor for r in q.run])
     for floor in dict.fromkeys(under.tolist()):
         mine = error[under == floor]
-        parts.append(f"{floor} {mine.mean():+.1f} ± {mine.std():.1f}")
+        parts.append(f"{floor} {mine.mean() + 0.0:+.1f} ± {mine.std():.1f}".replace("-0.0", "+0.0"))
         for condition in ("speed", "turn_deg_s"):
             x = np.array(getattr(q, condition))[under == floor]
             if len(x) > LEAST_FOR_TREND and np.ptp(x) > 0 and np.ptp(mine) > 0:
