@@ -15,7 +15,7 @@ from slipid.data.windows import windows
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.design.planned_runs import PlannedRun
-from slipid.infer.measured_windows import by_heading, measured_windows
+from slipid.infer.measured_windows import by_heading, driving_torque, measured_windows
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import (
