@@ -113,6 +113,7 @@ def _default(option: Any) -> str:
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "Robots and runs": ("Robot", "layout", "read_runs", "plot_runs", "check"),
+    "Reference robots": ("reference_robots", "reference_robot"),
     "Calibration and fit": ("calibrate", "fit", "Prior", "Fit", "Profile", "Validation"),
     "Uncertainty": ("Plan", "Posterior"),
     "On the robot": (

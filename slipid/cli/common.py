@@ -204,8 +204,9 @@ def emit(
         return
     if json is not None:
         write_json(Path(json), content)
-    data = [str(out / name) for name in written if name.endswith(".json")] if out else []
-    page = Page(rest=data[0] if data else json or "the file of --json FILE")
+    kept = [name for name in written if name.endswith(".html")]
+    kept += [name for name in written if name.endswith(".json")]
+    page = Page(rest=str(out / kept[0]) if out and kept else json or "the file of --json FILE")
     show(page)
     page.end()
     if out is not None:

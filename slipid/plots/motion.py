@@ -1,6 +1,7 @@
 """Figures of motion: slip and drift over heading, and predicted and measured paths."""
 
 from collections.abc import Callable, Mapping, Sequence
+from textwrap import fill
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -28,6 +29,8 @@ MOST_SPEEDS = 4
 """Largest number of speeds that are drawn."""
 STRAIGHT_RUNS, OTHER_RUNS = 16, 3
 """Largest numbers of runs in a panel of paths: if all runs are straight, and otherwise."""
+TITLE_WIDTH = 42
+"""Largest number of characters in a line of a panel's title."""
 LEAST_OCTANTS = 5
 """Smallest number of octants of headings with straight segments for a panel over heading."""
 
@@ -145,7 +148,7 @@ def path_figure(
         for run in shown:
             _ray(ax, run)
         text = errors.get(surface) or _errors([paths[k] for k in runs])
-        ax.set_title(f"{named(surface, load, names)}\n{text}", fontsize=10)
+        ax.set_title(f"{named(surface, load, names)}\n{fill(text, TITLE_WIDTH)}", fontsize=10)
         reach = 1.08 * max(float(np.abs(p).max()) for run in shown for p in run)
         ax.set_aspect("equal")
         ax.set(xlim=(-reach, reach), xlabel="ahead of the start [m]")

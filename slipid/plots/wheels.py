@@ -38,7 +38,7 @@ def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
     made, axes = drawing.panels(len(floors), 3.7, 3.9, title)
     drawn = None
     for ax, floor in zip(axes, floors, strict=True):
-        drawn = _cloud(ax, each[floor]) or drawn
+        drawn = _cloud(ax, each[floor], rolls) or drawn
         (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
         _curve(ax, fit, floor)
         ax.set(xlim=(min(0.0, left), right), ylim=(min(0.0, bottom), top))
@@ -74,10 +74,15 @@ def _slips(robot: Robot, measured: MeasuredWindows, floor: str) -> _Slips:
     return _Slips(torque[turns], measured.wheel_slip[turns], measured.sideways[turns])
 
 
-def _cloud(ax: Axes, dots: _Slips) -> PathCollection | None:
-    """Draw the measured slip of every turning wheel over its torque; return None for no wheel."""
+def _cloud(ax: Axes, dots: _Slips, rolls: bool) -> PathCollection | None:
+    """Draw the measured slip of every turning wheel over its torque; return None for no wheel.
+
+    Colours show the sideways motion of wheels that roll sideways.
+    """
     if not len(dots.slip):
         return None
+    if not rolls:
+        return ax.scatter(dots.torque, dots.slip, 9, drawing.SHADE, lw=0, alpha=0.6)
     order = np.argsort(-dots.sideways)
     colour = np.minimum(dots.sideways, 2.0)[order]
     x, y = dots.torque[order], dots.slip[order]

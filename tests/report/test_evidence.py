@@ -24,6 +24,7 @@ def made(small):
     return read_evidence(folder / "out/evidence.json"), load(folder / "out"), task.dataset
 
 
+@pytest.mark.slow
 def test_paths_and_regions_are_those_of_the_fit(made):
     evidence, fit, data = made
     assert [run.name for run in evidence.runs] == [log.name for log in data.logs]
@@ -42,6 +43,7 @@ def test_paths_and_regions_are_those_of_the_fit(made):
             assert np.all(np.diff(run.region.major_mm) > -0.2)  # a path becomes more uncertain
 
 
+@pytest.mark.slow
 def test_all_paths_begin_at_the_measured_pose(made):
     for run in made[0].runs:
         for track in run.models.values():
@@ -49,6 +51,7 @@ def test_all_paths_begin_at_the_measured_pose(made):
             assert track.y_mm[0] == pytest.approx(run.measured.y_mm[0], abs=3)
 
 
+@pytest.mark.slow
 def test_errors_of_quarters_add_up_to_those_of_the_runs(made):
     evidence = made[0]
     q = evidence.quarters
@@ -63,6 +66,7 @@ def test_errors_of_quarters_add_up_to_those_of_the_runs(made):
     assert all(0 <= h < 360 for h in q.heading_deg if h is not None)
 
 
+@pytest.mark.slow
 def test_currents_are_explained_better_after_the_fit_than_before(made):
     c = made[0].currents
     assert c is not None

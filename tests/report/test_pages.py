@@ -17,6 +17,7 @@ from tests.helpers import made_bench
 from tests.helpers.browser import WIDTHS, Shown, chromium
 from tests.helpers.shared import invoke
 
+pytestmark = pytest.mark.slow
 MOST_BYTES = 8_000_000
 CALIBRATED = {
     "differential": "diff_right",

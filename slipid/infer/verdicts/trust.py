@@ -155,9 +155,10 @@ def _of_numbers(numbers: list[Estimate]) -> Iterator[_Reason]:
             value = np.atleast_1d(np.asarray(e.value, float))
             if fnmatchcase(e.path, pattern) and not ((value >= low) & (value <= high)).all():
                 worst = float(value[np.argmax(np.abs(value))])
+                unit = "" if e.unit == "1" else f" {e.unit}"
                 yield (
                     2,
-                    f"{e.path} = {worst:.3g} {e.unit}; plausible values are {low:g} to {high:g}",
+                    f"{e.path} = {worst:.3g}{unit}; plausible values are {low:g} to {high:g}",
                 )
     bounds = [e.path for e in numbers if e.verdict == "at_bound"]
     if bounds:

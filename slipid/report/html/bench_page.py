@@ -22,6 +22,7 @@ from slipid.report.html.blocks import (
     badge,
     interval,
     number,
+    rounded,
 )
 from slipid.report.html.page import WebPage
 from slipid.support.content import Content
@@ -104,8 +105,8 @@ def _values(fit: BenchFit) -> PageSection:
 def _row(e: Estimate) -> Sequence[Cell]:
     known = e.prior_mean is not None and e.prior_std is not None
     prior = f"{number(e.prior_mean, 3)} ± {number(e.prior_std, 2)}" if known else ""
-    ends = interval(e.interval90)
-    return e.path, number(e.value), e.unit, ends, prior, badge(e.verdict), e.doc
+    shown, ends = rounded(e.value, e.interval90)
+    return e.path, shown, e.unit, ends, prior, badge(e.verdict), e.doc
 
 
 def _signals(fit: MotorFit) -> PageSection:
@@ -140,7 +141,10 @@ def _overlay(equation: Equation, which: str) -> FigureBlock:
         "showlegend": True,
     }
     alt = f"{title} (root mean square). Measured {channel} over time, and the one by the model."
-    caption = "The model computes it from the other measured signals, row by row."
+    caption = (
+        "The model computes it from the other measured signals, row by row; where the shaft "
+        "rests it predicts nothing."
+    )
     return FigureBlock(f"{channel}{which}", title, alt, data, layout, caption, 330)
 
 

@@ -158,6 +158,7 @@ def _signals(data: Runs) -> PageSection:
     kinds = ["speed", *(["current"] if data.current is not None else [])]
     names = [f"drive {w + 1}" for _ in kinds for w in range(wheels)]
     layout, axes, rows = draw.panels(len(names), names, wheels)
+    floors = list(dict.fromkeys(data.surface))
     traces = []
     for k in _drawn(data):
         span = data.rows(k)
@@ -166,7 +167,8 @@ def _signals(data: Runs) -> PageSection:
         speed = np.gradient(data.wheel_angle[span], data.time[span], axis=0)
         values = [speed, *([data.current[span]] if data.current is not None else [])]
         n = 0
-        for value, shade in zip(values, ("@blue", "@orange"), strict=False):
+        shade = draw.SERIES[floors.index(data.surface[k]) % len(draw.SERIES)]
+        for value in values:
             for w in range(wheels):
                 shown = [
                     None if not np.isfinite(v) else round(v, 3) for v in value[some, w].tolist()
@@ -183,7 +185,10 @@ def _signals(data: Runs) -> PageSection:
         layout[f"yaxis{axes[row * wheels]}"] |= draw.axis(unit)
     title = "Speeds" + (" and currents" if len(kinds) > 1 else "") + " of the drives over time [s]"
     alt = f"{title}, a panel for each drive, a line for each run."
-    figure = FigureBlock("signals", title, alt, traces, layout, "", 60 + 220 * rows, minimum=560)
+    caption = "A line for each run, in the colour of its floor as above; hover names the run."
+    figure = FigureBlock(
+        "signals", title, alt, traces, layout, caption, 60 + 220 * rows, minimum=560
+    )
     return PageSection("signals", "Signals of the wheels", [figure])
 
 

@@ -182,7 +182,20 @@ def _replayed(models: Predictions, data: Runs) -> Iterator[_Replay]:
             measured = np.where(chosen[:, None, None], _measured(contact.robot, w), measured)
             others = of_contact if scale is None else scale
             scale = np.where(chosen[:, None, None, None], of_contact, others)
-        yield _Replay(w, paths, measured, scale)
+        begun = {name: _begun(path, measured[:, 0]) for name, path in paths.items()}
+        yield _Replay(w, begun, measured, scale)
+
+
+def _begun(
+    path: Float[np.ndarray, "run edge 3"], start: Float[np.ndarray, "run 3"]
+) -> Float[np.ndarray, "run edge 3"]:
+    """Return paths that are moved to begin at other poses.
+
+    Models correct the poses by their own camera, and their starts differ by millimetres.
+    """
+    yaw = start[:, 2] - path[:, 0, 2]
+    moved = turned(yaw[:, None], path[..., :2] - path[:, :1, :2]) + start[:, None, :2]
+    return np.concatenate([moved, path[..., 2:] + yaw[:, None, None]], axis=-1)
 
 
 def _measured(robot: Robot, w: Windows) -> Float[np.ndarray, "run edge 3"]:

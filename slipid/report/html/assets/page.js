@@ -40,7 +40,11 @@ function laidOut(layout, height, data, width) {
     const lines = Math.ceil(entries / Math.max(1, Math.floor(width / LEGEND_ENTRY)));
     made.height += LEGEND_LINE * (lines - 1);
     made.margin.b = 64 + LEGEND_LINE * lines;
-    made.legend.y = -54 / (made.height - made.margin.t - made.margin.b);
+    const title = made.xaxis && made.xaxis.title && made.xaxis.title.text;
+    const below = 54 + (width < NARROW && title && broken(title) !== title ? 16 : 0);
+    made.margin.b += below - 54;
+    made.height += below - 54;
+    made.legend.y = -below / (made.height - made.margin.t - made.margin.b);
   }
   for (const side of ["xaxis", "yaxis"]) made[side] = made[side] || {};
   for (const key of Object.keys(made)) {
@@ -59,7 +63,12 @@ function broken(text) {
   return at < 0 ? text : `${text.slice(0, at)}<br>${text.slice(at + 1)}`;
 }
 
-const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
+const CONFIG = { responsive: true, displaylogo: false, modeBarButtons: [["toImage", "resetScale2d"]] };
+
+// The buttons of a figure are for the mouse: by keyboard they would be in the way.
+function quiet(div) {
+  for (const button of div.querySelectorAll(".modebar-btn")) button.tabIndex = -1;
+}
 
 function draw(div) {
   const figure = content.figures[div.dataset.figure];
@@ -72,7 +81,10 @@ function draw(div) {
   const layout = laidOut(figure.layout, figure.height, data, div.clientWidth);
   if (choice) layout.yaxis.title = { text: choice.value };
   div.style.height = `${layout.height}px`;
-  return Plotly.react(div, data, layout, CONFIG);
+  if (choice && figure.titles[choice.value]) {
+    div.closest("figure").querySelector("h3").textContent = figure.titles[choice.value];
+  }
+  return Plotly.react(div, data, layout, CONFIG).then(() => quiet(div));
 }
 
 const plots = [...document.querySelectorAll(".plot[data-figure]")];
@@ -136,6 +148,7 @@ class Player {
 
   show() {
     this.stop();
+    this.time.max = this.shown.time.length - 1;
     this.time.value = this.time.max;
     const run = this.shown, c = colours();
     const traces = [];
@@ -165,7 +178,8 @@ class Player {
       xaxis: { title: { text: "time [s]" } }, yaxis: { title: { text: "distance [mm]" }, rangemode: "tozero" },
       showlegend: false, shapes: [this.cursor(run.time.at(-1))],
     }, 240, over, this.off.clientWidth);
-    Plotly.react(this.off, over, axes, CONFIG);
+    Plotly.react(this.off, over, axes, CONFIG).then(() => quiet(this.off));
+    this.drawn.then(() => quiet(this.map));
     this.off.dataset.drawn = "yes";
     this.move();
   }
@@ -175,17 +189,19 @@ class Player {
   }
 
   move() {
-    const run = this.shown, last = run.time.length - 1;
-    const time = (run.time[last] * Number(this.time.value)) / Number(this.time.max);
-    let k = run.time.findIndex((t) => t >= time - 1e-9);
-    if (k < 0) k = last;
+    const run = this.shown, k = Number(this.time.value);
+    this.time.setAttribute("aria-valuetext", `${run.time[k].toFixed(1)} s`);
     const ends = this.lines.map((line) => [line.track[0][k] / 1000, line.track[1][k] / 1000]);
     const heads = ends.map((_, n) => 2 * n + 1);
     Plotly.restyle(this.map, { x: ends.map((e) => [e[0]]), y: ends.map((e) => [e[1]]) }, heads);
     const region = this.region(run, k);
     Plotly.restyle(this.map, { x: [region[0]], y: [region[1]] }, [2 * ends.length]);
     Plotly.relayout(this.off, { shapes: [this.cursor(run.time[k])] });
-    const errors = this.errors.map(({ line, mm }) => `${line.label} ${mm[k].toFixed(0)} mm`);
+    const errors = this.errors.map(({ line, mm }) => {
+      const turned = (line.track[2][k] - run.measured[2][k]) * (180 / Math.PI / 1000);
+      const heading = run.headings ? ` and ${Math.abs(turned).toFixed(1)} deg` : "";
+      return `${line.label} ${mm[k].toFixed(0)} mm${heading}`;
+    });
     const speed = run.speed === null ? "" : `, commanded ${run.speed} m/s`;
     this.state.textContent = `${run.floor}, load ${run.load}${speed}: ${run.path.toFixed(2)} m. ` +
       `After ${run.time[k].toFixed(1)} s off by: ${errors.join(", ")}.`;
@@ -210,12 +226,13 @@ class Player {
   start() {
     if (Number(this.time.value) >= Number(this.time.max)) this.time.value = 0;
     this.play.textContent = "Pause";
-    const step = Number(this.time.max) / Math.min(Math.max(this.shown.time.at(-1), 3), 12) / 12;
+    const seconds = Math.min(Math.max(this.shown.time.at(-1), 3), 12);
+    this.move();
     this.timer = setInterval(() => {
-      this.time.value = Number(this.time.value) + step;
+      this.time.value = Number(this.time.value) + 1;
       this.move();
       if (Number(this.time.value) >= Number(this.time.max)) this.stop();
-    }, 1000 / 12);
+    }, (1000 * seconds) / Number(this.time.max));
   }
 
   stop() {

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from slipid.app.reference_robots import ReferenceBand, reference_bands
+from slipid.app.reference_robots import ReferenceBand, reference_bands, reference_robot
 from slipid.report.html import figures as draw
 from slipid.report.html.blocks import (
     Block,
@@ -33,9 +33,7 @@ OTHERS = {
 def others(found: Results) -> PageSection | None:
     """Return the section about how this robot compares with reference robots."""
     errors = found.trust.get("held_out_error_over_path")
-    bands = {
-        m: reference_bands(found.drive, f"trust.held_out_error_over_path.*.{m}") for m in ERRORS
-    }
+    bands = {m: _bands(found, f"trust.held_out_error_over_path.*.{m}") for m in ERRORS}
     if not errors or not bands["selected"]:
         return None
     blocks: list[Block] = [
@@ -49,6 +47,13 @@ def others(found: Results) -> PageSection | None:
         _numbers(found),
     ]
     return PageSection("others", "Is this good?", blocks)
+
+
+def _bands(found: Results, path: str) -> tuple[ReferenceBand, ...]:
+    """Return a number of similar robots, without those that were identified from these logs."""
+    mine = found.run["data"]["hash"]
+    every = reference_bands(found.drive, path)
+    return tuple(b for b in every if reference_robot(b.robot).source.data_hash != mine)
 
 
 def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> FigureBlock:
@@ -73,11 +78,10 @@ def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> Figu
             )
         )
     selected = data[-1]
-    own = [x for x, y in zip(selected["x"], selected["y"], strict=True) if y.startswith("this")]
-    least = [b.value for b in bands["selected"]]
+    mine = [x for x, y in zip(selected["x"], selected["y"], strict=True) if y.startswith("this")]
+    theirs = [100 * b.value for b in bands["selected"]]
     title = (
-        f"This robot is predicted within {min(own):.2g} to {max(own):.2g} % of the path, others "
-        f"within {100 * min(least):.2g} to {100 * max(least):.2g} %"
+        f"This robot is predicted within {_span(mine)} of the path, others within {_span(theirs)}"
     )
     x = draw.axis("error on held-out runs [% of the path]")
     x |= {"type": "log"} if is_wide(every) else {"rangemode": "tozero"}
@@ -86,6 +90,12 @@ def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> Figu
     alt = f"{title}. Dots show the errors of three models on every floor of every robot."
     rows_shown = len(set(selected["y"]))
     return FigureBlock("others", title, alt, data, layout, "", 140 + 26 * rows_shown, minimum=460)
+
+
+def _span(percent: Sequence[float]) -> str:
+    """Return the smallest and the largest of some percentages as text."""
+    low, high = f"{min(percent):.2g}", f"{max(percent):.2g}"
+    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _numbers(found: Results) -> TableBlock:
@@ -100,7 +110,7 @@ def _rows(found: Results, path: str, text: str) -> Iterator[Sequence[Cell]]:
     for floor in found.floors:
         if (own := _own(found, path.replace("*", floor))) is not None:
             yield text, f"this robot, {floor}", number(own[0], 3), interval(own[1], 3)
-    for band in reference_bands(found.drive, path):
+    for band in _bands(found, path):
         where = f"{band.robot}, {band.floor.replace('_', ' ')}"
         yield text, where, number(band.value, 3), interval(band.interval90, 3)
 

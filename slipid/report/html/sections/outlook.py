@@ -1,5 +1,8 @@
 """Sections about what follows a fit: trial, further runs, comparison with others, provenance."""
 
+import math
+
+from slipid.infer.verdicts.trust import WORDS
 from slipid.report.html import figures as draw
 from slipid.report.html.blocks import (
     Block,
@@ -49,6 +52,7 @@ def trial(found: Results) -> PageSection | None:
     figure = FigureBlock("trial_errors", title, title, data, layout, caption, 130 + 34 * len(names))
     rows = [
         (
+            n,
             t["controllers"].get(n, n),
             f"{t['summary'][n]['closure_error_median']:.0f}",
             f"{t['summary'][n]['cross_track_rmse']:.0f}",
@@ -57,9 +61,20 @@ def trial(found: Results) -> PageSection | None:
         )
         for n in reversed(names)
     ]
-    head = ("controller", "closure [mm]", "cross-track [mm]", "heading [deg]", "finished [%]")
+    head = (
+        "controller",
+        "what it is",
+        "closure [mm]",
+        "cross-track [mm]",
+        "heading [deg]",
+        "finished [%]",
+    )
     plant = "the fitted model itself" if t["plant"] == "twin" else "a robot in a physics engine"
-    about = f"Errors of the controllers; the simulated robot is {plant}."
+    site = f" ({t['site']})" if t.get("site") else ""
+    about = (
+        f"Errors of the controllers on the path '{t['path']}'. The simulated robot is "
+        f"{plant}{site}; its floor: {t['map']}."
+    )
     return PageSection(
         "trial", "Trial of controllers", [figure, TableBlock(about, head, rows, right=head[1:])]
     )
@@ -77,12 +92,12 @@ def design(found: Results) -> PageSection | None:
             run["load"],
             f"{run['heading_deg']:.0f} deg" if run["speed"] else "",
             f"{run['speed']:g}" if run["speed"] else "",
-            f"{run['turn_rate']:.2f}" if run["turn_rate"] else "",
+            f"{math.degrees(run['turn_rate']):.0f}" if run["turn_rate"] else "",
             f"{run['seconds']:.1f}",
         )
         for k, run in enumerate(d["runs"], start=1)
     ]
-    head = ("run", "floor", "load", "direction", "speed [m/s]", "turn [rad/s]", "seconds")
+    head = ("run", "floor", "load", "direction", "speed [m/s]", "turn [deg/s]", "seconds")
     about = "Runs that narrow the intervals most, in the order in which to drive them."
     blocks: list[Block] = [TableBlock(about, head, rows, right=head[4:])]
     if d["messages"]:
@@ -117,7 +132,7 @@ def provenance(found: Results) -> PageSection:
     blocks.append(CopyLines("What you can do next", "\n".join(lines)))
     files = ["robot.json"] if found.has_robot else []
     files += [f"{name}/" for name in found.exports]
-    if files:
+    if files and found.trust.get("verdict") != WORDS[-1]:
         blocks.append(TextBlock([f"Files to deploy: {', '.join(files)}."]))
     return PageSection("provenance", "Provenance and next steps", blocks)
 

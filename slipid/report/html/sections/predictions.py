@@ -171,7 +171,7 @@ def _ranking(content: Content) -> list[Block]:
             behind = [-models[m]["difference"] for m in order]
             data = [
                 draw.errors(
-                    [max(b, 0.1) for b in behind],
+                    behind,
                     [label(m) for m in order],
                     spread,
                     "nats per run behind the best",
@@ -179,25 +179,31 @@ def _ranking(content: Content) -> list[Block]:
                 )
             ]
             layout = {
-                "xaxis": draw.axis("log density behind the best [nats per run]", type="log"),
+                "xaxis": draw.axis("behind the best [nats per run]", rangemode="tozero"),
                 "yaxis": {"automargin": True},
                 "showlegend": False,
             }
             name = f"ranking_{question}_{floor}"
-            title = f"{question} held out: {one['sentence']}"
+            best, then = order[-1], order[-2] if len(order) > 1 else order[-1]
+            title = f"{question} held out, {floor}: {label(best)} is best, then {label(then)}"
             alt = f"{title}. Dots show how far every model is behind the best."
-            out.append(FigureBlock(name, title, alt, data, layout, "", 130 + 22 * len(order)))
-            best = order[::-1][:SHOWN_RANKS]
+            caption = (
+                f"{one['sentence']}. One nat behind: the poses of a run are 2.7 times less "
+                "probable under that model."
+            )
+            height = 130 + 22 * len(order)
+            out.append(FigureBlock(name, title, alt, data, layout, caption, height))
+            listed = order[::-1][:SHOWN_RANKS]
             rows = [
                 (
                     label(m),
                     f"{models[m]['difference']:.1f}",
                     f"{100 * models[m]['endpoint_error']:.1f}",
                 )
-                for m in best
+                for m in listed
             ]
             head = ("model", "log density [nats per run]", "end error [% of chord]")
-            about = f"The {len(best)} best of {len(order)} models on {floor}."
+            about = f"The {len(listed)} best of {len(order)} models on {floor}."
             out.append(TableBlock(about, head, rows, right=head[1:], folded=True))
     return out
 
@@ -213,7 +219,7 @@ def paths(found: Results) -> PageSection | None:
     about = (
         "Every run of the fit, predicted from its first pose and the wheels alone, as if it were "
         "the only run of its session. The ellipse is the 90 % region of the selected model. These "
-        "runs were fitted: the errors of held-out runs are above."
+        f"runs were fitted: the errors of held-out runs are above.{_inside(evidence.runs)}"
     )
     alt = (
         "Measured path of a run, and its predictions by the config's lengths, by calibrated "
@@ -221,6 +227,20 @@ def paths(found: Results) -> PageSection | None:
     )
     blocks: list[Block] = [TextBlock([about]), Player(runs, {m: label(m) for m in names}, alt)]
     return PageSection("paths", "Play a run", blocks)
+
+
+def _inside(runs: Sequence[RunEvidence]) -> str:
+    """Return a sentence on how many runs end inside their 90 % region; empty without regions."""
+    inside = []
+    for run in runs:
+        if run.region is None:
+            continue
+        k, end = run.region.edge[-1], run.models[run.selected]
+        off = np.array([run.measured.x_mm[k] - end.x_mm[k], run.measured.y_mm[k] - end.y_mm[k]])
+        c, s = (f(run.region.angle_mrad[-1] / 1000) for f in (np.cos, np.sin))
+        axes = np.array([run.region.major_mm[-1], run.region.minor_mm[-1]])
+        inside.append(bool(np.sum((np.array([[c, s], [-s, c]]) @ off / axes) ** 2) <= 1.0))
+    return f" {sum(inside)} of {len(inside)} end inside their region." if inside else ""
 
 
 def _played(run: RunEvidence) -> Content:
@@ -237,6 +257,7 @@ def _played(run: RunEvidence) -> Content:
         "measured": _flat(run.measured),
         "models": {name: _flat(track) for name, track in run.models.items()},
         "region": region,
+        "headings": any(run.measured.yaw_mrad),
         "selected": run.selected,
         "error": round(1000 * end_error(run, run.selected)),
     }
@@ -298,14 +319,15 @@ def residuals(found: Results) -> PageSection | None:
             for column, (text, unit) in ERRORS.items():
                 choices[f"{text} [{unit}]"].append([getattr(q, column)[n] for n in mine])
         layout[f"yaxis{panel}"]["zeroline"] = True
-    title = _largest_bias(q, runs, floors)
+    titles = {
+        f"{text} [{unit}]": _bias(q, column, f"{text} [{unit}]", runs)
+        for column, (text, unit) in ERRORS.items()
+    }
+    title = next(iter(titles.values()))
     alt = f"{title}. Dots show predicted less measured motion in quarters of runs."
-    caption = (
-        "Predicted less measured motion of the selected model in quarters of the runs. A cloud "
-        "around zero without a trend means that nothing systematic is left."
-    )
+    caption = "Predicted less measured motion of the selected model in quarters of the runs."
     figure = FigureBlock(
-        "residuals", title, alt, data, layout, caption, 60 + 260 * rows, choices, minimum=520
+        "residuals", title, alt, data, layout, caption, 60 + 260 * rows, choices, titles, 520
     )
     return PageSection("residuals", "What the model leaves unexplained", [figure])
 
@@ -315,12 +337,36 @@ def _varies(column: Sequence[float | None]) -> bool:
     return len(there) > 2 and max(there) - min(there) > 1e-3
 
 
-def _largest_bias(q: Quarters, runs: Sequence[RunEvidence], floors: Sequence[str]) -> str:
-    """Return a sentence about the mean and the spread of the errors along the motion by floor."""
-    parts = []
-    for floor in floors:
-        mine = np.array(
-            [x for x, r in zip(q.along_mm_s, q.run, strict=True) if runs[r].floor == floor]
-        )
-        parts.append(f"{floor} {mine.mean():+.1f} ± {mine.std():.1f} mm/s")
-    return f"Error along the motion, mean and spread: {', '.join(parts)}"
+TREND = 0.4
+"""Rank correlation of errors with a condition from which on a trend is named [1]."""
+
+
+def _bias(q: Quarters, column: str, text: str, runs: Sequence[RunEvidence]) -> str:
+    """Return a sentence on mean, spread and trends of one error, floor by floor.
+
+    Args:
+        q: quarters of the runs.
+        column: column of the error.
+        text: name of the error, with its unit.
+        runs: the runs.
+    """
+    from scipy.stats import spearmanr
+
+    error, parts, trends = np.array(getattr(q, column)), [], []
+    under = np.array([runs[r].floor for r in q.run])
+    for floor in dict.fromkeys(under.tolist()):
+        mine = error[under == floor]
+        parts.append(f"{floor} {mine.mean() + 0.0:+.1f} ± {mine.std():.1f}".replace("-0.0", "+0.0"))
+        for condition in ("speed", "turn_deg_s"):
+            x = np.array(getattr(q, condition))[under == floor]
+            if len(x) > LEAST_FOR_TREND and np.ptp(x) > 0 and np.ptp(mine) > 0:
+                rank = float(spearmanr(x, mine).statistic)
+                if abs(rank) > TREND:
+                    name = CONDITIONS[condition].split(" [")[0]
+                    trends.append(f"{'rises' if rank > 0 else 'falls'} with {name} on {floor}")
+    trend = f"; it {', '.join(trends)}" if trends else "; no trend with speed or turn"
+    return f"Error {text}, mean and spread: {', '.join(parts)}{trend}"
+
+
+LEAST_FOR_TREND = 12
+"""Smallest number of quarters in which a trend is looked for."""

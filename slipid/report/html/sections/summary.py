@@ -14,9 +14,9 @@ from slipid.report.html.blocks import (
     TextBlock,
     badge,
     enumerated,
-    interval,
     label,
     number,
+    rounded,
 )
 from slipid.report.html.figures import axis, dots
 from slipid.report.html.results import Results
@@ -24,6 +24,8 @@ from slipid.support.content import Content
 
 MOST_NOTES = 5
 """Largest number of notes beside the verdict; further ones are in the section on data quality."""
+UNDETERMINED = 1.5
+"""Width of an interval over that of the prior from which on the interval is not shown [1]."""
 USE = {
     WORDS[0]: "Use it on the floors below: no simpler model predicts held-out runs better.",
     WORDS[1]: "Use it with care, and read the reasons first.",
@@ -47,7 +49,14 @@ def verdict(found: Results) -> PageSection:
         if reasons := found.trust["reasons"]:
             blocks.append(TextBlock(reasons, listed=True, kind="warning"))
         blocks.append(_floors(found))
-    notes = ranked_notes(found)
+    if found.sample is not None and not found.sample["converged"]:
+        more = f"slipid sample {found.folder.name} --most 2000"
+        text = (
+            f"The posterior has not converged ({found.sample['reason']}), and all intervals are "
+            f"from it: continue with `{more}`."
+        )
+        blocks.append(TextBlock([text], kind="warning"))
+    notes = [note for note in ranked_notes(found) if "posterior did not converge" not in note]
     if notes:
         blocks.append(TextBlock(notes[:MOST_NOTES], listed=True, kind="note"))
     return PageSection("verdict", "Verdict", blocks)
@@ -63,26 +72,20 @@ def ranked_notes(found: Results) -> list[str]:
 
 
 def _floors(found: Results) -> TableBlock:
-    """Return a table of the floors with the selected model and its error."""
+    """Return a table of the floors with the selected model and the errors of all models."""
+    errors = found.trust["held_out_error_over_path"]
+    models = list(dict.fromkeys(model for each in errors.values() for model in each))
     rows: list[Sequence[Cell]] = []
-    for floor, errors in found.trust["held_out_error_over_path"].items():
-        chosen = found.selected[floor]
-        nominal = errors.get("nominal")
-        rows.append(
-            (
-                floor,
-                label(chosen),
-                percent(errors[chosen]),
-                "" if nominal is None else percent(nominal),
-                str(found.trust["runs"][floor]),
-            )
-        )
+    for floor, each in errors.items():
+        shown = (percent(each[model]) if model in each else "" for model in models)
+        chosen = label(found.selected[floor])
+        rows.append((floor, chosen, *shown, str(found.trust["runs"][floor])))
     caption = (
-        "Model selected on each floor, and how far it and the lengths of the config are off on "
-        "held-out runs, as a share of the path length."
+        "Model selected on each floor, and errors of all models on held-out runs, as a share of "
+        "the path length. Of many runs some, evenly chosen, are predicted."
     )
-    head = ("floor", "selected model", "error", "with the config's lengths", "runs")
-    return TableBlock(caption, head, rows, right=("error", "with the config's lengths", "runs"))
+    head = ("floor", "selected model", *map(label, models), "predicted runs")
+    return TableBlock(caption, head, rows, right=head[2:])
 
 
 def percent(value: float) -> str:
@@ -101,7 +104,9 @@ def numbers(found: Results) -> PageSection | None:
         [
             "Lengths are effective ones: with them, odometry without a slip model is right on "
             "average on that floor. Multipliers are ratios to the lengths of the config, as "
-            "drive controllers of ROS take them."
+            "drive controllers of ROS take them. Lines that begin with # are remarks, or numbers "
+            "that the logs do not determine. Where the force balance is selected, robot.json "
+            "predicts better than any lengths: `slipid export` brings it to the robot."
         ]
     )
     blocks: list[Block] = [about, CopyLines("Numbers to type in", text)]
@@ -118,7 +123,7 @@ def _calibrated_lines(found: Results) -> Iterator[str]:
     if c is None:
         return
     for floor, one in c["surfaces"].items():
-        yield f"\n# floor: {floor}"
+        yield f"\n# floor: {floor}{_error_of_lengths(found, floor)}"
         radii = one["rolling_radius_m"]
         for name, value in zip(
             drive_names(len(radii), bool(c.get("steering"))), radii, strict=False
@@ -133,12 +138,12 @@ def _calibrated_lines(found: Results) -> Iterator[str]:
             if centre["verdict"] != "fixed":
                 yield _line("centre_of_rotation_ahead_m", centre)
         multipliers = c["multipliers"][floor]
-        for name, value in zip(
-            drive_names(len(radii), False), multipliers["wheel_radius"], strict=False
-        ):
-            yield f"{name}wheel_radius_multiplier: {value:.5f}"
+        names = drive_names(len(radii), False)
+        for name, ratio, value in zip(names, multipliers["wheel_radius"], radii, strict=False):
+            yield f"{_hidden(value)}{name}wheel_radius_multiplier: {ratio:.5f}"
         length = "wheel_separation" if len(radii) == 2 else "base"
-        yield f"{length}_multiplier: {multipliers['track']:.5f}"
+        base = one.get("effective_track_m") or one["effective_base_m"]
+        yield f"{_hidden(base)}{length}_multiplier: {multipliers['track']:.5f}"
     yield "\n# pose sensor"
     ahead, left = c["pose_offset_m"]
     yield _line("pose_sensor_ahead_m", ahead)
@@ -153,6 +158,23 @@ def _calibrated_lines(found: Results) -> Iterator[str]:
             yield _line(f"steering_{name}", value)
 
 
+def _error_of_lengths(found: Results, floor: str) -> str:
+    """Return a remark on the error of odometry with calibrated lengths on a floor."""
+    errors = found.trust.get("held_out_error_over_path", {}).get(floor, {})
+    if "calibrated" not in errors:
+        return ""
+    text = f" (odometry with these lengths: off by {percent(errors['calibrated'])} of the path"
+    chosen = found.selected[floor]
+    if chosen == "contact":
+        text += f"; selected {label(chosen)}: {percent(errors[chosen])}"
+    return f"{text})"
+
+
+def _hidden(value: Content) -> str:
+    """Return the mark of a remark for a number that the logs do not determine."""
+    return "# " if value["verdict"] in ("not_identified", "at_bound", "fixed") else ""
+
+
 def drive_names(count: int, steered: bool) -> list[str]:
     """Return the prefix of the name of each drive."""
     if steered:
@@ -163,8 +185,8 @@ def drive_names(count: int, steered: bool) -> list[str]:
 MOTOR = {
     "motor.resistance": "motor_resistance_ohm",
     "motor.back_emf": "motor_back_emf_v_s_per_rad",
-    "motor.coulomb_friction": "motor_coulomb_friction_n_m",
-    "motor.viscous_friction": "motor_viscous_friction_n_m_s_per_rad",
+    "motor.coulomb_friction": "coulomb_friction_at_wheel_n_m",
+    "motor.viscous_friction": "viscous_friction_at_wheel_n_m_s_per_rad",
 }
 """Name of each number of a motor to type in, keyed by path."""
 
@@ -173,21 +195,18 @@ def _motor_lines(found: Results) -> Iterator[str]:
     """Yield lines about the motor; numbers that the logs do not determine are comments."""
     known = {p: found.parameters[p] for p in MOTOR if p in found.parameters}
     if known:
-        yield "\n# motor (at its shaft)"
+        yield "\n# motors (winding at the shaft; friction at the wheel, behind the gear)"
     for path, value in known.items():
-        hidden = value["verdict"] in ("not_identified", "at_bound", "fixed")
-        yield ("# " if hidden else "") + _line(MOTOR[path], value)
+        yield _line(MOTOR[path], value)
 
 
 def _line(name: str, value: Content) -> str:
     """Return a line with a number, its interval and, if it is not good, its verdict."""
-    ends = value["interval90"]
-    text = f"{name}: {number(value['value'], 5)}"
-    comments = []
-    if ends is not None and ends[0] != ends[1]:
-        comments.append(interval(ends, 5))
+    shown, ends = rounded(value["value"], value["interval90"])
+    comments = [ends] if value["interval90"] is not None and value["verdict"] != "fixed" else []
     if value["verdict"] != "identified":
         comments.append(value["verdict"].replace("_", " "))
+    text = f"{_hidden(value)}{name}: {shown}"
     return f"{text}  # {'; '.join(comments)}" if comments else text
 
 
@@ -200,8 +219,9 @@ def values(found: Results) -> PageSection | None:
     if rows:
         head = ("parameter", "value", "unit", "90 % interval", "prior", "verdict", "meaning")
         caption = (
-            f"Parameters of the force balance: {_counts(found)}. The prior is what was known "
-            "before the logs, as mean and standard deviation."
+            f"Parameters of the force balance: {_counts(found)}. Intervals are those of the "
+            f"{_origin(found)}. The prior is what was known before the logs, as mean and standard "
+            "deviation."
         )
         blocks.append(TableBlock(caption, head, rows, right=("value",)))
         if (figure := _narrowing(found)) is not None:
@@ -211,7 +231,41 @@ def values(found: Results) -> PageSection | None:
         if fixed:
             caption = "Values that were given or have the default, and were not fitted."
             blocks.append(TableBlock(caption, head, fixed, right=("value",), folded=True))
+    if apart := _apart(found):
+        blocks += [TextBlock(["Measured twice, with different results:"]), apart]
     return PageSection("values", "Values and intervals", blocks) if blocks else None
+
+
+def _apart(found: Results) -> TextBlock | None:
+    """Return sentences on numbers of the pose sensor on which calibration and fit disagree."""
+    c, out = found.calibration, []
+    if c is None or found.fit is None:
+        return None
+    for name, value, path in (
+        ("lag of the poses", c["pose_lag_s"], "camera.lag"),
+        ("true over logged length", c["pose_scale"], "camera.scale"),
+        ("yaw of the pose sensor", c["pose_yaw_rad"], "camera.marker_yaw"),
+    ):
+        other = found.parameters.get(path)
+        if other is None or other["interval90"] is None or value["verdict"] == "fixed":
+            continue
+        (low, high), (a, b) = value["interval90"], other["interval90"]
+        if a > high or b < low:
+            mine, its = rounded(value["value"], (low, high)), rounded(other["value"], (a, b))
+            out.append(
+                f"{name}: {mine[0]} {value['unit']} ({mine[1]}) by the calibrated kinematics, "
+                f"{its[0]} ({its[1]}) by the force balance. Each belongs to its own model: type in "
+                "that of the calibration; robot.json has that of the selected model"
+            )
+    return TextBlock(out, listed=True, kind="warning") if out else None
+
+
+def _origin(found: Results) -> str:
+    """Return where the intervals come from."""
+    if not any(e["source"] == "posterior" for e in found.parameters.values()):
+        return "Laplace approximation"
+    bad = found.sample is not None and not found.sample["converged"]
+    return "posterior, which has NOT converged" if bad else "posterior"
 
 
 def _counts(found: Results) -> str:
@@ -228,10 +282,9 @@ def calibration_table(c: Content) -> TableBlock:
     def row(name: str, value: Content) -> None:
         factor, unit = (1000.0, "mm") if value["unit"] == "m" else (1.0, value["unit"])
         ends = [factor * end for end in value["interval90"]]
-        shown = "" if value["verdict"] == "fixed" else interval(ends, 5)
-        rows.append(
-            (name, number(factor * value["value"], 5), unit, shown, badge(value["verdict"]))
-        )
+        shown, span = rounded(factor * value["value"], ends)
+        span = "" if value["verdict"] == "fixed" else span
+        rows.append((name, shown, unit, span, badge(value["verdict"])))
 
     steered = bool(c.get("steering"))
     for floor, one in c["surfaces"].items():
@@ -272,11 +325,14 @@ def _rows(found: Results, fixed: bool) -> Iterator[Sequence[Cell]]:
             prior = ""
             if isinstance(mean, float) and isinstance(std, float):
                 prior = f"{number(mean, 3)} ± {number(std, 2)}"
+            shown, ends = rounded(part(e["value"]), part(e["interval90"]))  # type: ignore[arg-type]
+            if (e.get("ratio") or 0.0) > UNDETERMINED:
+                ends = "wider than the prior"
             yield (
                 f"{path} [{name}]" if name else path,
-                number(part(e["value"])),  # type: ignore[arg-type]
+                shown,
                 e["unit"],
-                interval(part(e["interval90"]), 3),  # type: ignore[arg-type]
+                ends,
                 prior,
                 badge(e["verdict"]) if k == 0 else Badge(""),
                 e.get("doc", "") if k == 0 else "",
@@ -293,7 +349,7 @@ def _narrowing(found: Results) -> FigureBlock | None:
     if not shown:
         return None
     order = sorted(shown, key=lambda p: shown[p])
-    width = [max(min(shown[p], 1.0), 1e-3) for p in order]
+    width = [max(min(shown[p], 10.0), 1e-3) for p in order]
     kinds = {
         "good": ("identified", "@blue", "circle"),
         "weak": ("weak or disputed", "@orange", "square"),
@@ -320,8 +376,8 @@ def _narrowing(found: Results) -> FigureBlock | None:
         "xaxis": axis(
             "width of the interval over that of the prior",
             type="log",
-            tickvals=[0.001, 0.01, 0.1, 1],
-            ticktext=["1/1000", "1/100", "1/10", "1 (nothing learnt)"],
+            tickvals=[0.001, 0.01, 0.1, 1, 10],
+            ticktext=["1/1000", "1/100", "1/10", "1", "10"],
         ),
         "yaxis": {
             "automargin": True,
@@ -350,7 +406,7 @@ def _narrowing(found: Results) -> FigureBlock | None:
         alt,
         data,
         layout,
-        "Further left: more learnt from the logs.",
+        "Further left: more learnt; at 1 or above: nothing.",
         110 + 17 * len(order),
         minimum=420,
     )
@@ -360,18 +416,29 @@ def _remedies(found: Results) -> list[Block]:
     """Return what to do about parameters that the logs do not determine well."""
     if found.fit is None:
         return []
-    unknown: dict[str, list[str]] = {}
+    unknown: dict[tuple[str, str], list[str]] = {}
     for flat in found.fit["flat"]:
-        if flat["remedy"]:
-            paths = unknown.setdefault(flat["remedy"], [])
-            paths += [p for p in flat["paths"] if p not in paths]
-    out = [f"{remedy}: for {enumerated(paths)}" for remedy, paths in unknown.items()]
+        for path in flat["paths"] if flat["remedy"] else ():
+            part, _, rest = path.partition(".")
+            floor = rest.partition(".")[0] if part == "surface" else ""
+            paths = unknown.setdefault((floor, flat["remedy"]), [])
+            if path not in paths and "session_yaw" not in path:
+                paths.append(path)
+    out = []
+    for (floor, remedy), paths in sorted(unknown.items()):
+        where = f"on {floor}: {remedy.replace('drive there', 'drive')}" if floor else remedy
+        if paths:
+            out.append(f"{where}: for {enumerated(paths)}")
     weak = [p for p, e in found.parameters.items() if e["verdict"] == "weak"]
-    if weak:
+    if weak and found.design is None:
         command = f"slipid design {found.folder.name}"
         out.append(
             f"run `{command}`, which proposes the runs that narrow them most: for "
             f"{enumerated(weak)}, which are weak"
+        )
+    elif weak:
+        out.append(
+            f"drive the runs of 'What to drive next': for {enumerated(weak)}, which are weak"
         )
     if not out:
         return []

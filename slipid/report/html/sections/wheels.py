@@ -138,13 +138,14 @@ def slip(found: Results) -> PageSection | None:
         data.append(draw.onto(shade | {"legendgroup": "band", "showlegend": first}, panel))
         data.append(draw.onto(draw.line(torque, c["slip"], "fitted", "@blue", **group), panel))
         layout[f"xaxis{panel}"] |= draw.axis("torque of a wheel [N m]")
-        layout[f"yaxis{panel}"] |= draw.axis("slip [1]")
+        layout[f"yaxis{panel}"] |= draw.axis("slip [1]") | _span(evidence, floor, c["slip_hi"])
     title = _slip_title(found)
     alt = f"{title}. Dots of measured slip of single wheels over their torque, and fitted curves."
     caption = (
-        "Dots: slip of single wheels in segments of the runs, by the measured poses, over the "
-        "torque by the measured current, scaled to an even load. The curve is that of a wheel "
-        "that rolls straight ahead."
+        "Slip is 1 less the speed of the wheel over the floor divided by that of its rim. Dots: "
+        "single wheels in segments of the runs, by the measured poses, over the torque by the "
+        "measured current (or the predicted torque), scaled to an even load. The curve is that of "
+        "a wheel that rolls straight ahead; one that also moves sideways slips more."
     )
     figure = FigureBlock(
         "slip",
@@ -157,6 +158,17 @@ def slip(found: Results) -> PageSection | None:
         minimum=420,
     )
     return PageSection("slip", "Slip of the wheels", [figure])
+
+
+def _span(evidence: FitEvidence | None, floor: str, high: list[float]) -> Content:
+    """Return the range of the axis of slip, without the most extreme dots."""
+    if evidence is None or evidence.slip is None:
+        return {}
+    s, runs = evidence.slip, evidence.runs
+    mine = [s.slip[n] for n, r in enumerate(s.run) if r < len(runs) and runs[r].floor == floor]
+    low, top = np.quantile(mine, [0.01, 0.99]) if mine else (0.0, 0.0)
+    low, top = min(float(low), 0.0), max(float(top), *high)
+    return {"range": [low - 0.05 * (top - low), top + 0.05 * (top - low)]}
 
 
 def _panel_title(found: Results, floor: str) -> str:

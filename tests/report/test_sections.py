@@ -1,0 +1,184 @@
+"""What the sections of a page say, of made contents of a result folder."""
+
+import json
+
+import pytest
+
+from slipid.report.html.blocks import CopyLines, FigureBlock, TableBlock, TextBlock, rounded
+from slipid.report.html.fit_page import fit_page
+from slipid.report.html.results import read_results
+
+
+def value(x, half, verdict="identified", unit="m"):
+    interval = [x - half, x + half]
+    return {"value": x, "interval90": interval, "std": half / 1.6, "verdict": verdict, "unit": unit}
+
+
+CALIBRATION = {
+    "surfaces": {
+        "wood": {
+            "rolling_radius_m": [value(0.0497, 1e-4), value(0.0504, 1e-4)],
+            "effective_track_m": value(0.312, 0.2, "not_identified"),
+        }
+    },
+    "centre_of_rotation_m": {},
+    "pose_offset_m": [value(0.06, 0.001), value(0.0, 0.001)],
+    "pose_yaw_rad": value(0.01, 0.005, unit="rad"),
+    "pose_session_yaw_rad": {},
+    "pose_lag_s": value(0.08, 0.004, unit="s"),
+    "pose_scale": value(1.0, 0.0, "fixed", "1"),
+    "multipliers": {"wood": {"wheel_radius": [0.994, 1.008], "track": 1.04}},
+    "nominal": {"wheel_radius_m": 0.05, "track_m": 0.3},
+    "noise": {"place": 0.001, "heading": 0.003},
+    "settled": True,
+}
+
+
+def parameter(x, interval, verdict, ratio, unit="1"):
+    shared = {"unit": unit, "shape": [], "labels": [], "std": 0.1, "source": "laplace"}
+    prior = {"doc": "", "ratio": ratio, "prior_mean": 0.4, "prior_std": 0.2}
+    own = {"value": x, "interval90": interval, "verdict": verdict, "provenance": "measured"}
+    return shared | prior | own
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of a differential robot with a force balance, selected on no floor."""
+    parameters = {
+        "motor.resistance": parameter(1.2, [1.1, 1.3], "identified", 0.1, "ohm"),
+        "surface.wood.friction": parameter(9.2, [1.5, 57.0], "not_identified", 4.0),
+        "camera.lag": parameter(0.05, [0.04, 0.06], "identified", 0.2, "s"),
+    }
+    errors = {"nominal": 0.05, "calibrated": 0.004, "contact": 0.02}
+    trust = {
+        "verdict": "not to be trusted",
+        "reasons": ["surface.wood.friction = 9.2; plausible values are 0.005 to 5"],
+        "notes": [f"note {k}" for k in range(8)],
+        "runs": {"wood": 6},
+        "held_out": {"wood": True},
+        "held_out_error_over_path": {"wood": errors},
+    }
+    identified = {
+        "schema": "slipid.identified/1",
+        "parameters": parameters,
+        "derived": {},
+        "surfaces": ["wood"],
+        "curves": {},
+        "messages": [],
+        "calibration": CALIBRATION,
+        "selected_model": {"wood": "calibrated"},
+        "trust": trust,
+        "data": {"hash": "ab" * 32, "runs": ["wood/0.csv"]},
+    }
+    run = {
+        "finished": "2026-01-01T00:00:00+00:00",
+        "seconds": 9.0,
+        "config": {"name": "robot.toml", "sha256": "cd" * 32},
+        "data": {"folder": "logs", "hash": "ab" * 32, "logs": {"wood/0.csv": "e"}, "skipped": []},
+        "versions": {"slipid": "0"},
+    }
+    flat = {
+        "paths": ["surface.wood.friction"],
+        "formula": "the data have almost no information about surface.wood.friction",
+        "remedy": "drive there loaded unevenly",
+    }
+    behind = {"nominal": [0.046, 0.01], "calibrated": [0.0, 0.0], "contact": [0.016, 0.02]}
+    fit = {
+        "parameters": parameters,
+        "flat": [flat],
+        "selection": {"wood": {"behind": behind}},
+        "converged": True,
+        "reason": "no parameter changed",
+    }
+    for name, content in (("identified", identified), ("run", run), ("fit", fit)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    (tmp_path / "config.toml").write_text('[robot]\ndrive = "differential"\n')
+    (tmp_path / "robot.json").write_text("{}")
+    return tmp_path
+
+
+def page_of(folder):
+    """Blocks of every section of the page of a folder, keyed by the section's name."""
+    return {s.name: list(s.blocks) for s in fit_page(read_results(folder)).sections}
+
+
+def words(blocks):
+    return " ".join(" ".join(b.sentences) for b in blocks if isinstance(b, TextBlock))
+
+
+def test_the_verdict_stands_first_with_its_reasons_and_at_most_five_notes(folder):
+    page = fit_page(read_results(folder))
+    assert page.badge is not None
+    assert (page.sections[0].name, page.badge.text) == ("verdict", "not to be trusted")
+    said = words(page.sections[0].blocks)
+    assert "Do not deploy" in said
+    assert "9.2; plausible" in said
+    assert "note 4" in said
+    assert "note 5" not in said
+    assert "note 5" in words(page_of(folder)["data"])
+    assert "Files to deploy" not in words(page_of(folder)["provenance"])
+
+
+def test_numbers_that_the_logs_do_not_determine_are_remarks_in_what_is_copied(folder):
+    (code,) = (b for b in page_of(folder)["numbers"] if isinstance(b, CopyLines))
+    lines = code.text.splitlines()
+    assert "left_wheel_radius_m: 0.04970  # 0.04960 to 0.04980" in lines
+    assert any(line.startswith("# effective_track_m") for line in lines)
+    assert "# wheel_separation_multiplier: 1.04000" in lines
+    assert any("off by 0.4 % of the path" in line for line in lines)
+    live = [line for line in lines if line and not line.startswith("#")]
+    assert all("not identified" not in line for line in live)
+
+
+def test_values_say_what_was_learnt_what_to_do_and_what_is_measured_twice(folder):
+    blocks = page_of(folder)["values"]
+    rows = {r[0]: r for b in blocks if isinstance(b, TableBlock) for r in b.rows}
+    assert rows["surface.wood.friction"][3] == "wider than the prior"
+    assert rows["motor.resistance"][1:4] == ("1.20", "ohm", "1.10 to 1.30")
+    said = words(blocks)
+    assert "on wood: drive loaded unevenly: for surface.wood.friction" in said
+    assert "lag of the poses: 0.0800 s (0.0760 to 0.0840) by the calibrated kinematics" in said
+    (figure,) = (b for b in blocks if isinstance(b, FigureBlock))
+    assert figure.title == "The logs determine 2 of 3 parameters"
+
+
+def test_errors_stand_beside_those_of_every_simpler_model(folder):
+    figure, table = page_of(folder)["errors"]
+    assert figure.title == "wood: calibrated kinematics off by 0.4 %, the config's lengths by 5 %"
+    assert [row[1] for row in table.rows] == [
+        "lengths of the config",
+        "calibrated kinematics",
+        "force balance",
+    ]
+    assert table.rows[2][3] == "+1.60 ± 3.29"
+
+
+def test_a_page_has_no_section_without_content(folder):
+    sections = page_of(folder)
+    assert not {"paths", "currents", "loads", "slip", "posterior", "trial", "design"} & set(
+        sections
+    )
+    assert all(blocks for blocks in sections.values())
+
+
+def test_a_posterior_that_has_not_converged_is_a_warning_with_the_command_to_type(folder):
+    worst = {"r_hat": 1.1, "effective_draws": 40.0, "steps_per_tau": 9.0}
+    sample = {"converged": False, "reason": "40 effective draws", "worst": worst}
+    sample |= {"ensembles": 4, "walkers": 8, "steps": 100}
+    (folder / "sample.json").write_text(json.dumps(sample))
+    warnings = [b for b in page_of(folder)["verdict"] if getattr(b, "kind", "") == "warning"]
+    assert f"slipid sample {folder.name} --most" in words(warnings)
+
+
+@pytest.mark.parametrize(
+    ("number", "ends", "shown"),
+    [
+        (5.5881, (0.68, 10.49), ("5.6", "0.7 to 10.5")),
+        (0.080756, (0.080195, 0.081321), ("0.08076", "0.08020 to 0.08132")),
+        (9.2, (1.5, 57.0), ("9.2", "1.5 to 57")),
+        (1.0, None, ("1", "")),
+        (331.9, (329.7, 334.3), ("331.9", "329.7 to 334.3")),
+    ],
+)
+def test_values_have_the_digits_of_their_intervals(number, ends, shown):
+    assert rounded(number, ends) == shown
