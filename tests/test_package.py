@@ -3,6 +3,7 @@ from __future__ import annotations
 import ast
 import importlib.metadata
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -12,6 +13,7 @@ import pytest
 
 import slipid
 
+ROOT = Path(__file__).resolve().parents[1]
 EXTRA = (
     *("matplotlib", "plotly", "jinja2", "rosbags", "pyarrow", "pyulog", "mcap", "cv2", "mujoco"),
     *("emcee", "arviz_base", "arviz_stats", "arviz_plots", "xarray", "h5netcdf", "h5py", "sklearn"),
@@ -101,3 +103,12 @@ def test_no_public_name_is_that_of_a_room():
     """A module that is imported would hide the function of its name."""
     rooms = {path.stem for path in Path(slipid.__file__).parent.iterdir()}
     assert not rooms & set(slipid.__all__)
+
+
+def test_files_that_the_guide_for_contributors_names_exist():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([\w/]+(?:/|\.py|\.toml))`|\]\(([\w/.]+)\)", text)
+    paths = [Path(code or link) for code, link in named]
+    assert len(paths) > 20
+    homes = (ROOT, ROOT / "slipid")
+    assert [path for path in paths if not any((home / path).exists() for home in homes)] == []

@@ -27,7 +27,7 @@ from slipid.predict.selection import (
 from slipid.search_space import Space
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_json
-from slipid.support.progress import Reporter
+from slipid.support.progress import COMPILING_S, Reporter
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +56,9 @@ class CalibrationResult:
 
 def calibrated(task: FitTask, report: Reporter) -> KinematicFit:
     """Return the calibrated kinematics of a task, and report their numbers."""
-    report.stage("calibrated kinematics")
+    report.stage("calibrated kinematics", usual_s=COMPILING_S)
     space = Space(task.robot, task.choices)
-    found = kinematic_fit(task.dataset, space, task.choices)
+    found = kinematic_fit(task.dataset, space, task.choices, report.steps)
     for sentence in found.calibration.sentences:
         report.line(sentence)
     return found

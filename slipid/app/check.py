@@ -32,7 +32,7 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
-from slipid.support.progress import Reporter
+from slipid.support.progress import Reporter, Tell, silent
 
 MOST_CALIBRATED = 64
 """Largest number of runs that a check calibrates."""
@@ -193,7 +193,7 @@ def check(
     task, part = calibration_part(task, content["findings"], report)
     content |= part
     report.stage("expected information")
-    content |= expected_if_any(task).to_json()
+    content |= expected_if_any(task, report.steps).to_json()
     if out is not None:
         write_json(out / "check.json", content)
     return task.dataset, content
@@ -285,21 +285,22 @@ def _clock(clock: Clock) -> Content:
     }
 
 
-def expected_if_any(task: FitTask) -> ExpectedEstimates:
+def expected_if_any(task: FitTask, tell: Tell = silent) -> ExpectedEstimates:
     """Return the expected estimates of a fit to a task, or why there are none."""
     try:
-        return expected(task, task.problem())
+        return expected(task, task.problem(), tell)
     except DataError as error:  # the logs leave no windows to fit
         return ExpectedEstimates({}, {}, (f"no estimate of a fit can be predicted: {error}",))
 
 
-def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
+def expected(task: FitTask, problem: Problem, tell: Tell = silent) -> ExpectedEstimates:
     """Return the expected estimates from the information that a fit would have.
 
     This information depends on the parameters and the noise, which are not known before a fit. It
     is computed as after a fit, at plausible values of the parameters: those from which a fit
     starts, and draws of the prior. They are combined with two sizes of the noise: that of the runs'
-    scatter before any physics explains it, and the typical one with which a fit begins.
+    scatter before any physics explains it, and the typical one with which a fit begins. `tell`
+    reports the progress.
     """
     space, w = problem.space, problem.windows
     keep, volt = problem.full_weight, w.has_voltage
@@ -310,7 +311,8 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
     ratios: dict[str, ExpectedEstimate] = {}
     open_: tuple[FlatDirection, ...] = ()
     most = -np.inf
-    for z, levels in _plausible(space, noises):
+    cases = list(_plausible(space, noises))
+    for count, (z, levels) in enumerate(cases, start=1):
         for covariance in problem.laplaces(z, levels, keep):
             flat = flat_directions(space, covariance, *where)
             found = estimates(space, task.choices, z, covariance, volt, members(flat))
@@ -319,6 +321,7 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
             uncertainty = float(np.linalg.slogdet(covariance)[1])
             if uncertainty > most:
                 most, open_ = uncertainty, flat
+        tell(count, len(cases))
     possible = {path: e.best.verdict for path, e in parameters.items()}
     open_ = tuple(one for one in open_ if _is_certain(one, possible))
     return ExpectedEstimates(parameters, ratios, sentences(open_))

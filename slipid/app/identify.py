@@ -1,5 +1,6 @@
 """Fit of a robot to the logs of a config or to runs, with verdicts and result files."""
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +17,7 @@ from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.data.check.findings import wrong
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.multi_floor_fit import fit_multi_floor
-from slipid.fitting.optimise import Optimum, optimise
+from slipid.fitting.optimise import Optimum, optimise, start_rounds
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
 from slipid.infer.result import Fit
@@ -35,7 +36,7 @@ from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, writable, write_json
 from slipid.support.jax_setup import setup_jax
-from slipid.support.progress import Reporter
+from slipid.support.progress import COMPILING_S, Reporter
 
 NEAR_OPTIMUM = 3
 """Round number given to a start near the optimum, so that the fit does not repeat its first rounds,
@@ -237,12 +238,16 @@ def _optimised(
     start, history = before
     first: list[float] = []
 
+    of_start = start_rounds(problem.space)
+    rounds_done = itertools.count(1)
+
     def tell(state: FitState) -> None:
-        report.stage(state.stage)
         what = f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std"
-        if state.stage != "joint":  # the stages of the start have fixed numbers of rounds
-            report.note(what)
+        if state.stage != "joint":
+            report.stage("first values, floor by floor")
+            report.advance(next(rounds_done), of_start, state.stage)
             return
+        report.stage("joint")
         # Progress is measured in the logarithm of the step size, which shrinks to the tolerance.
         moved = max(state.moved, 1e-12)
         first.append(max(moved, 2 * settings.tolerance))
@@ -252,7 +257,7 @@ def _optimised(
         if kept is not None:
             kept.save(CHECKPOINT, state.arrays | {"history": np.array(history)})
 
-    report.stage("compiling")
+    report.stage("compiling", usual_s=COMPILING_S)
     rounds = settings.rounds
     if start is not None and start.moved < settings.tolerance:
         rounds = start.round  # the state has converged: only what follows the rounds is missing
@@ -281,12 +286,12 @@ def summarised(
     The slip model of every floor is selected. Runs over several floors, if the task has some, are
     fitted as well.
     """
-    report.stage("intervals and verdicts")
+    report.stage("intervals and verdicts", usual_s=COMPILING_S)
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
         fit = _with_mixed_runs(fit, task, problem, optimum, report)
     report.stage("predicting held-out runs")
-    contact = contact_errors(task.dataset, problem, optimum)
+    contact = contact_errors(task.dataset, problem, optimum, report.steps)
     selection = selected(
         task.dataset, {**kinematic.errors, "contact": contact}, kinematic.contradicted
     )

@@ -20,7 +20,7 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
-from slipid.support.progress import Reporter
+from slipid.support.progress import COMPILING_S, Reporter
 
 FOLDER = "sampling"
 """Name of the folder, inside the result folder, with the blocks of an unfinished chain."""
@@ -54,14 +54,14 @@ def sample(
     task = read_fit_task(read_config(out / "config.toml"), folder, report)
     task = replace(task, choices=fit.choices)  # those of the calibration are not in the config
     _refuse_other_logs(fit, task)
-    report.stage("compiling")
+    report.stage("compiling", usual_s=COMPILING_S)
     fit = replace(fit, problem=task.problem(fit.robot), data=task.dataset)
     # The key has everything that the draws depend on. The largest length of the chain is not part
     # of the key, so that a chain that ended at the limit can be continued with a larger limit.
     inputs = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
     kept = Checkpoint(out / FOLDER, key_of(*inputs, np.asarray(fit.z), np.asarray(fit.covariance)))
     posterior = sampled(fit, plan, draws, kept, report)
-    report.stage("writing")
+    report.stage("predictions of the draws, and writing", usual_s=COMPILING_S)
     about = _summary(posterior, plan, time.monotonic() - began)
     marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict) and k != "schema"}
     netcdf.write(netcdf.tree(posterior, marks), out / "posterior.nc")

@@ -11,6 +11,9 @@ from slipid.support.progress import Reporter
 if TYPE_CHECKING:
     from slipid.infer.design.proposal import Design
 
+SIMULATING_S = 40.0
+"""Usual time in which candidate runs are simulated, on two cores [s]."""
+
 
 @for_robots
 def design(
@@ -71,7 +74,7 @@ def design(
     with Reporter(quiet=quiet) as report:
         setup_jax(quiet=True)
         fit = load_fit(out)
-        report.stage("simulating candidate runs")
+        report.stage("simulating candidate runs", usual_s=SIMULATING_S)
         scope = Scope(fit, *goals, runs, headings, speeds, turns, distance, *places)
         found = proposal.design(scope)
         written = write(found, out, report)

@@ -156,7 +156,7 @@ def _draw(done: "IdentifyResult", out: Path, report: Reporter) -> list[Path]:
     drawn: list[Path] = []
     try:
         warning = done.fit.trust.warning
-        drawn += identify_plots(done.fit, done.task.dataset, out, warning)
+        drawn += identify_plots(done.fit, done.task.dataset, out, warning, report.steps)
     except DataError as error:  # a run is too short to be drawn; the results are already written
         report.line(f"no further pictures: {error}")
     if done.profiles:

@@ -39,6 +39,8 @@ from slipid.support.progress import Reporter
 
 FORMS = ("c", "ros2", "stablehlo", "table")
 """Forms of a robot that can be exported, see `slipid.exports.description.ABOUT`."""
+WRITING_C_S = 40.0
+"""Usual time in which the example is driven and the step is traced and written as C [s]."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def export(
     content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
     forms = tuple(form for form in FORMS if form in options.forms)
     for form in forms:
-        report.stage(f"writing {form}")
+        report.stage(f"writing {form}", usual_s=WRITING_C_S if form == "c" else None)
         files: Mapping[str, str | bytes]
         if form == "c":
             plant = twin_plant(robot, floor, place, 0, actuator_model_of(robot, gyro=row.gyro))

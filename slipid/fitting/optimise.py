@@ -42,6 +42,8 @@ LENGTHS = ("robot.wheel_radius", "robot.radius_deviation", "robot.base_radius")
 """Paths of the lengths of the robot that slip can imitate."""
 HELD_ROUNDS = 2
 """Number of rounds of the staged start in which all parameters but these lengths move."""
+FLOOR_STEPS = (15, 6, 6)
+"""Largest numbers of solver steps in the rounds that fit each floor, from each start."""
 SAME_LENGTHS = 0.02
 """Largest difference between lengths that are taken for the same, over the lengths [1]."""
 _MOST_REFUSED = 12
@@ -189,6 +191,12 @@ def one_round(
     )
 
 
+def start_rounds(space: Space) -> int:
+    """Return the number of rounds of `staged_start`."""
+    apart = np.abs(space.start - space.prior_mean)[_lengths(space)].max(initial=0.0) > SAME_LENGTHS
+    return len(CREEPS) * len(FLOOR_STEPS) * (2 if apart else 1) + HELD_ROUNDS
+
+
 def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], None]) -> FitState:
     """Return a start for the joint fit: motor by regression, then each floor from several starts.
 
@@ -241,7 +249,7 @@ def _floors_fitted(
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
         # Many steps at first, since the damping starts at 1, far below the scale of the problem.
-        for steps in (15, 6, 6):
+        for steps in FLOOR_STEPS:
             state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))

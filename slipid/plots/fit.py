@@ -17,6 +17,7 @@ from slipid.plots.drawing import add_warning, figure, save, save_all
 from slipid.plots.motion import heading_figure, path_figure, runs_by_setup
 from slipid.plots.wheels import current_figure, curve_figure
 from slipid.predict.validation import Validation
+from slipid.support.progress import Tell, silent
 
 
 def raw_plots(data: Runs, out: Path) -> list[Path]:
@@ -146,13 +147,19 @@ FIGURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
 """Functions that draw the figures of a fit, keyed by name; they return None if data are missing."""
 
 
-def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) -> list[Path]:
+def identify_plots(
+    fit: Fit, data: Runs, out: Path, warning: str | None = None, tell: Tell = silent
+) -> list[Path]:
     """Write all `FIGURES` that the runs of the fit have data for; return the files.
 
-    If the fit cannot be trusted, `warning` is added to the title of each figure.
+    If the fit cannot be trusted, `warning` is added to the title of each figure. `tell` reports the
+    progress.
     """
     measured = measured_windows(fit.robot, data, fit.channels.windows)
-    made = {name: draw(fit, data, measured) for name, draw in FIGURES.items()}
+    made: dict[str, Figure | None] = {}
+    for count, (name, draw) in enumerate(FIGURES.items(), start=1):
+        made[name] = draw(fit, data, measured)
+        tell(count, len(FIGURES))
     if warning is not None:
         for figure in filter(None, made.values()):
             add_warning(figure, warning)

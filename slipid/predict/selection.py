@@ -30,7 +30,7 @@ from jaxtyping import Float, Int
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
 from slipid.data.windows import incomplete_poses
-from slipid.fitting.calibration.estimate import cross_calibrated, evenly
+from slipid.fitting.calibration.estimate import cross_calibrated, evenly, most_rounds
 from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
@@ -48,6 +48,7 @@ from slipid.predict.slip_models import FloorModels
 from slipid.predict.steps import Steps, TwistModel
 from slipid.search_space import Choice, Space
 from slipid.support.content import Content
+from slipid.support.progress import Tell, silent
 
 LEAST_SECTORS, MOST_GROUPS = 4, 6
 """Smallest number of sectors of each floor in which sectors are held out, and largest number of
@@ -155,18 +156,23 @@ class KinematicFit:
         )
 
 
-def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> KinematicFit:
+def kinematic_fit(
+    data: Runs, space: Space, choices: Sequence[Choice], tell: Tell = silent
+) -> KinematicFit:
     """Return the calibration of runs, and errors of `nominal` and `calibrated` on held-out runs.
 
-    Arguments are those of `slipid.fitting.calibration.estimate.calibrate`.
+    Arguments are those of `slipid.fitting.calibration.estimate.cross_calibrated`.
     """
     fold, robot = selection_folds(data), space.template
-    whole, without = cross_calibrated(data, space, choices, fold)
+    picked, rounds = _picked(data, fold), most_rounds(data)
+    total = rounds + len(picked)
+    whole, without = cross_calibrated(data, space, choices, fold, lambda k, _: tell(k, total))
     floors = list(whole.radius)
     names = [*MODELS[:2], *floors]
     errors = {name: np.full(len(data), np.nan) for name in names}
     plain = FloorModels(nominal(robot.geometry))
-    for k, runs in _picked(data, fold).items():
+    for count, (k, runs) in enumerate(picked.items()):
+        tell(rounds + count, total)
         calibration = without.get(k, whole)
         seen, own = calibration.seen(robot), calibrated_model(calibration, robot.geometry)
         whole_poses = np.array([incomplete_poses(data, run) is None for run in runs.tolist()])
@@ -182,6 +188,7 @@ def kinematic_fit(data: Runs, space: Space, choices: Sequence[Choice]) -> Kinema
             for name, (model, at) in cases.items():
                 tracks = replay.tracks_from_increments(seen, w, model.increments(at, seen))
                 errors[name][runs[tracks.run]] = path_errors(tracks, w.parts)
+    tell(total, total)
     kept = {name: errors[name] for name in MODELS[:2]}
     return KinematicFit(whole, kept, tuple(_mislabelled(data, errors, floors)))
 
@@ -276,18 +283,23 @@ def _mislabelled(data: Runs, errors: Errors, floors: Sequence[str]) -> Iterator[
             )
 
 
-def contact_errors(data: Runs, problem: Problem, optimum: Optimum) -> Float[np.ndarray, " run"]:
+def contact_errors(
+    data: Runs, problem: Problem, optimum: Optimum, tell: Tell = silent
+) -> Float[np.ndarray, " run"]:
     """Return the errors of the force balance on held-out runs; nan for runs not predicted.
 
     Args:
         data: runs on one floor each, from which the windows of the problem were made.
         problem: likelihood of the runs.
         optimum: end of its fit.
+        tell: function that reports the progress.
     """
     fold, state, out = selection_folds(data), optimum.state, np.full(len(data), np.nan)
     linear = problem.linear(state.z, problem.electric(state.z, state.log_variance))
     of_segment = fold[problem.windows.run]
-    for k, runs in _picked(data, fold).items():
+    picked = _picked(data, fold)
+    for count, (k, runs) in enumerate(picked.items()):
+        tell(count, len(picked))
         keep = problem.full_weight
         keep[: len(of_segment)] = of_segment != k
         if k < 0:
@@ -298,6 +310,7 @@ def contact_errors(data: Runs, problem: Problem, optimum: Optimum) -> Float[np.n
         for w in replay.replay_windows(data.subset(runs), model.robot):
             tracks = model.tracks(w)
             out[runs[tracks.run]] = path_errors(tracks, w.parts)
+    tell(len(picked), len(picked))
     return out
 
 

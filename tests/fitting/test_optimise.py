@@ -14,7 +14,13 @@ from scipy.linalg import block_diag
 
 from slipid.fitting import problem as of_problem
 from slipid.fitting import variances
-from slipid.fitting.optimise import LinearisedResiduals, _stacked, levenberg, optimise
+from slipid.fitting.optimise import (
+    LinearisedResiduals,
+    _stacked,
+    levenberg,
+    optimise,
+    start_rounds,
+)
 from slipid.fitting.problem import FitState, Problem, Twists, effects_given, without_effects
 from slipid.fitting.variances import DEGREES
 from slipid.search_space import Choice
@@ -304,6 +310,8 @@ def test_the_staged_start_finds_the_way_from_far_off(surface_problem, surface_fi
     held = [s for s in states if s.stage == "all but the lengths"]
     radii = [float(value(problem, s, "robot.wheel_radius")) for s in held]
     assert radii == pytest.approx([0.04, 0.04])
+    of_start = [s for s in states if s.stage != "joint"]
+    assert len(of_start) == start_rounds(problem.space)  # so that their progress is known
     assert float(value(problem, found.state, "robot.wheel_radius")) != radii[1]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
+from rich.progress import TimeRemainingColumn
 
 from slipid.support import progress
 from slipid.support.progress import Reporter
@@ -39,6 +40,43 @@ def test_the_time_left_is_that_of_the_steps_after_the_first(capsys, monkeypatch)
         "  run 2, about 80 s left",
         "  run 3, about 70 s left",
     ]
+
+
+def test_a_stage_that_compiles_has_its_usual_time(capsys):
+    with Reporter() as report:
+        report.stage("compiling", usual_s=15.0)
+        report.stage("fitting")
+        report.steps(3, 12)
+        report.steps(12, 12)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["compiling ... (the first time usually 15 s)", "fitting ...", "  100 %"]
+
+
+def test_on_a_terminal_the_usual_time_is_counted_down_until_progress_is_known(monkeypatch):
+    now = [100.0]
+    report = Reporter()
+    bars = report._bars
+    monkeypatch.setattr(bars, "get_time", lambda: now[0])
+    column = next(c for c in bars.columns if isinstance(c, TimeRemainingColumn))
+
+    def left():
+        [task] = bars.tasks
+        return column(task).plain
+
+    report.stage("compiling", usual_s=75.0)
+    assert left() == "1:15"
+    now[0] = 110.0
+    assert left() == "1:05"
+    now[0] = 500.0
+    assert left() == "0:00"
+    report.stage("calibrating", usual_s=75.0)
+    report.advance(0, 10)
+    now[0] = 510.0
+    report.advance(1, 10)
+    assert left() == "1:05"
+    now[0] = 514.0
+    report.advance(2, 10)
+    assert left() == "0:00:32"
 
 
 def test_lines_come_no_closer_than_they_should(capsys, monkeypatch):

@@ -27,7 +27,7 @@ and correction of systematic odometry errors in mobile robots" (UMBmark), IEEE T
 Robotics and Automation 12(6).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -68,6 +68,7 @@ from slipid.fitting.calibration.space import (
 )
 from slipid.model.kinematics import Steering, nominal_base, nominal_steering
 from slipid.search_space import Choice, Space
+from slipid.support.progress import Tell, silent
 
 DEGREES = 4.0
 """Degrees of freedom of the Student t of runs."""
@@ -291,14 +292,19 @@ def calibrate(data: Runs, space: Space, choices: Sequence[Choice] = ()) -> Calib
 
 
 def cross_calibrated(
-    data: Runs, space: Space, choices: Sequence[Choice], fold: Int[np.ndarray, " run"]
+    data: Runs,
+    space: Space,
+    choices: Sequence[Choice],
+    fold: Int[np.ndarray, " run"],
+    tell: Tell = silent,
 ) -> tuple[Calibration, dict[int, Calibration]]:
     """Return the calibration from all runs, and for each fold that from all runs outside it.
 
     The latter follow from the former by one Gauss-Newton step, which is exact for numbers in which
-    the poses are linear. Arguments are those of `calibrate`; runs with fold -1 are never left out.
+    the poses are linear. Arguments are those of `calibrate`; runs with fold -1 are never left out,
+    and `tell` reports the progress.
     """
-    fit = _fitted(data, space, choices)
+    fit = _fitted(data, space, choices, tell)
     (r, slope), (_, a) = fit.linear, fit.gradient
     of_track, without = fold[fit.tracks.run], {}
     for k in sorted(set(of_track.tolist()) - {-1}):
@@ -309,8 +315,13 @@ def cross_calibrated(
     return _result(fit), without
 
 
-def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
-    """Return the end of a calibration; arguments are those of `calibrate`."""
+def most_rounds(data: Runs) -> int:
+    """Return the largest number of rounds in which runs are calibrated."""
+    return MOST_ROUNDS if len(data) <= MOST_START else 2 * MOST_ROUNDS
+
+
+def _fitted(data: Runs, space: Space, choices: Sequence[Choice], tell: Tell = silent) -> _Fit:
+    """Return the end of a calibration; arguments are those of `cross_calibrated`."""
     model = CalibrationSpace.of(space, choices, data, 0)
     z = np.array([model.numbers[name].mean for name in model.free])
     lag = pose_lag(data)
@@ -319,13 +330,21 @@ def _fitted(data: Runs, space: Space, choices: Sequence[Choice]) -> _Fit:
     typical = np.concatenate([_TYPICAL[:2], np.tile(_TYPICAL[2:] + 2.0, len(model.floors))])
     # Many runs only refine what a part of them has found.
     some = evenly(data.surface, MOST_START) if len(data) > MOST_START else None
-    fit = _rounds(_started(model, data, z, typical, some), choices)
-    return fit if some is None else _rounds(_cut(replace(fit, runs=None)), choices)
+    total = most_rounds(data)
+    fit = _rounds(_started(model, data, z, typical, some), choices, lambda k: tell(k, total))
+    if some is None:
+        return fit
+    whole = _cut(replace(fit, runs=None))
+    return _rounds(whole, choices, lambda k: tell(MOST_ROUNDS + k, total))
 
 
-def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
-    """Return the fit after rounds that estimate the numbers, the variances and the weights."""
-    for _ in range(MOST_ROUNDS):
+def _rounds(fit: _Fit, choices: Sequence[Choice], tell: Callable[[int], None]) -> _Fit:
+    """Return the fit after rounds that estimate the numbers, the variances and the weights.
+
+    `tell` is called with the number of rounds before each, and with their largest number at last.
+    """
+    for k in range(MOST_ROUNDS):
+        tell(k)
         before = fit
         fit = fit.solved().with_noise().with_weights()
         radius = [float(np.mean(row)) for row in fit.model.kinematics(fit.z).radius]
@@ -336,7 +355,9 @@ def _rounds(fit: _Fit, choices: Sequence[Choice]) -> _Fit:
             fit.model.firmest == before.model.firmest
             and _in_stds(fit.z - before.z, fit.gradient[1]) < SETTLED
         ):
+            tell(MOST_ROUNDS)
             return replace(fit, settled=True)
+    tell(MOST_ROUNDS)
     return replace(fit, settled=False)
 
 

@@ -32,7 +32,7 @@ from slipid.infer.result import Fit, required
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.files import write_bytes
-from slipid.support.progress import Reporter
+from slipid.support.progress import COMPILING_S, Reporter
 
 MOST_UNMOVED = 0.01
 """Largest tolerated fraction of draws whose electric parameters have no accepted proposal."""
@@ -62,7 +62,7 @@ def sampled(
     if len(parts) > 1:
         second = Density(problem, fitted, ELECTRIC)
         if second.size:
-            report.stage(f"sampling {ELECTRIC}")
+            report.stage(f"sampling {ELECTRIC}", usual_s=COMPILING_S)
             drawn, moved = electric_given_motion(first, second, fitted.covariance, x, plan.seed)
             out[..., second.structure] = drawn
             accepted[ELECTRIC] = float(moved.mean())

@@ -70,7 +70,7 @@ def selftest(
     test.plausible(task, problem)
     writable(out)
     report.stage("expected information")
-    before = expected(task, problem)
+    before = expected(task, problem, report.steps)
     kept = Checkpoint(out, key_of(config.hash, task.data_hash, seed))
     rows = test.replicates(task, problem, count, seed, kept, report)
     found = {

@@ -71,7 +71,7 @@ def write_fit_report(fit: Fit, runs: Runs, out: Path, report: Reporter) -> tuple
         report: reporter of the progress.
     """
     report.stage("gathering what the page shows")
-    return _written(evidence_of_fit(fit, runs), out, report)
+    return _written(evidence_of_fit(fit, runs, report.steps), out, report)
 
 
 def write_calibration_report(
@@ -85,7 +85,7 @@ def write_calibration_report(
     task, found = done.task, done.calibration
     robot = found.seen(task.robot)
     models = Predictions(task.dataset, found, task.robot.geometry, robot, None, done.models)
-    return _written(evidence_of_predictions(models, task.data_hash), out, report)
+    return _written(evidence_of_predictions(models, task.data_hash, tell=report.steps), out, report)
 
 
 def _written(evidence: FitEvidence, out: Path, report: Reporter) -> tuple[str, ...]:
@@ -127,6 +127,6 @@ def renew(out: Path, logs: Path | None, report: Reporter) -> Path:
         folder = log_folder(out, logs)
         task = read_fit_task(read_config(out / "config.toml"), folder, report)
         report.stage("gathering what the page shows")
-        write_evidence(evidence_of_fit(fit, task.dataset), out)
+        write_evidence(evidence_of_fit(fit, task.dataset, report.steps), out)
     report.stage("writing the page")
     return write_report(out)

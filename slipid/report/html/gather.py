@@ -27,6 +27,7 @@ from slipid.predict.slip_model import body_poses, turned
 from slipid.predict.slip_models import FloorModels
 from slipid.report.html import evidence as ev
 from slipid.support.errors import DataError
+from slipid.support.progress import Tell, silent
 
 MOST_POSES, MOST_REGIONS = 65, 12
 """Largest numbers of poses, and of regions, that are kept of a run."""
@@ -77,12 +78,13 @@ class Predictions:
         return self.selected.get(floor, usual)
 
 
-def evidence_of_fit(fit: Fit, data: Runs) -> ev.FitEvidence:
+def evidence_of_fit(fit: Fit, data: Runs, tell: Tell = silent) -> ev.FitEvidence:
     """Return the evidence of a fit.
 
     Args:
         fit: the fit, which may have been loaded from its files.
         data: its runs on one floor each.
+        tell: function that reports the progress.
     """
     chosen = {floor: one.model for floor, one in fit.selection.items()}
     models = Predictions(data, fit.calibration, fit.config_shape, fit.seen, fit.contact, chosen)
@@ -92,17 +94,20 @@ def evidence_of_fit(fit: Fit, data: Runs) -> ev.FitEvidence:
         dots = _dots(fit, data)
     except DataError as error:  # a run that is too short to be cut into segments
         notes.append(f"no slip of single wheels: {error}")
-    found = evidence_of_predictions(models, fit.data_hash, notes)
+    found = evidence_of_predictions(models, fit.data_hash, notes, tell)
     return found.model_copy(update={"correlations": _correlations(fit), **dots})
 
 
 def evidence_of_predictions(
-    models: Predictions, data_hash: str, notes: Sequence[str] = ()
+    models: Predictions, data_hash: str, notes: Sequence[str] = (), tell: Tell = silent
 ) -> ev.FitEvidence:
-    """Return the evidence of predicted runs, without that of a force balance."""
+    """Return the evidence of predicted runs, without that of a force balance.
+
+    `tell` reports the progress.
+    """
     data, notes = models.data, list(notes)
     reasons = [incomplete_poses(data, k) for k in range(len(data))]
-    runs = _paths(models, [k for k, reason in enumerate(reasons) if reason is None])
+    runs = _paths(models, [k for k, reason in enumerate(reasons) if reason is None], tell)
     whole = set(runs)
     for k, reason in enumerate(reasons):
         if reason is not None and (run := _aligned(models, k)) is not None:
@@ -150,13 +155,14 @@ class _Replay:
     scale: Float[np.ndarray, "run edge 2 2"] | None
 
 
-def _paths(models: Predictions, whole: Sequence[int]) -> dict[int, ev.RunEvidence]:
+def _paths(models: Predictions, whole: Sequence[int], tell: Tell) -> dict[int, ev.RunEvidence]:
     """Return the evidence of the runs with these indices, whose poses are whole."""
     out: dict[int, ev.RunEvidence] = {}
     if whole:
         for done in _replayed(models, models.data.subset(whole)):
             for n, k in enumerate(done.w.run.tolist()):
                 out.setdefault(whole[k], _run(models, done, n, whole[k]))
+            tell(len(out), len(whole))
     return out
 
 
