@@ -221,7 +221,7 @@ def _show_files(page: "Page", out: Path, written: Sequence[str]) -> None:
     first = order[0] if order else written[0]
     page.line(f"in {out}: {'look first at ' if order else ''}{first}")
     others = ", ".join(name for name in written if name != first)
-    for line in wrap(others, 76):
+    for line in wrap(others, 76, break_long_words=False, break_on_hyphens=False):
         page.line(f"  {line}")
 
 
