@@ -233,10 +233,11 @@ for panel, commands in PANELS.items():
         )(command.run)
 
 
-def _print_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> bool:
     if wanted:
         typer.echo(f"slipid {__version__}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()
