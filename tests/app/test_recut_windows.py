@@ -79,7 +79,7 @@ def test_chains_are_of_windows_and_choices_as_the_fit_has_them(monkeypatch, tmp_
             raise Asked(near, self.choices)
 
     fit = SimpleNamespace(robot="the robot of the fit", choices="those of its calibration, too")
-    nothing = ("_refuse_mixed", "_log_folder", "_refuse_other_logs", "read_config")
+    nothing = ("_refuse_mixed", "log_folder", "_refuse_other_logs", "read_config")
     for name in nothing:
         monkeypatch.setattr(sample, name, lambda *_: None)
     monkeypatch.setattr(sample, "load", lambda _: fit)
