@@ -61,6 +61,10 @@ class Page:
         return "\n".join(line.rstrip() for line in lines)
 
     def table(self, table: Table) -> None:
+        """Write a table below its title, which is a line of its own, however narrow the table."""
+        title, table.title = table.title, None
+        if title:
+            self._console.print(title, markup=False, soft_wrap=True)
         self._console.print(table)
 
     def line(self, text: str = "") -> None:
