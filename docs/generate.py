@@ -46,7 +46,7 @@ def commands() -> str:
 
     from slipid.cli.main import app
 
-    every = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    every = typer.main.get_group(app).commands
     panels: dict[str, list[str]] = {}
     for name, command in every.items():
         panel = getattr(command, "rich_help_panel", None)

@@ -7,7 +7,8 @@ from rich.table import Table
 from rich.text import Text
 
 from slipid.fitting.calibration.result import Calibration
-from slipid.report.page import Page, counted, heading, interval, percent, rounded, table, verdict
+from slipid.report.numbers import interval, rounded
+from slipid.report.page import Page, counted, heading, percent, table, verdict
 
 if TYPE_CHECKING:
     from slipid.fitting.calibration.result import Value
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 def show_calibration(page: Page, found: Calibration) -> None:
     """Write calibrated lengths, floor by floor, and the place of the pose sensor."""
-    every = _values(found)
+    every = calibrated_values(found)
     page.table(_table(every))
     by: dict[str, list[str]] = {}
     for group, rows in every.items():
@@ -35,7 +36,7 @@ def show_calibration(page: Page, found: Calibration) -> None:
         )
 
 
-def _values(found: Calibration) -> "dict[str, dict[str, Value]]":
+def calibrated_values(found: Calibration) -> "dict[str, dict[str, Value]]":
     """Return the calibrated numbers by name, keyed by floor or by what they belong to."""
     every: dict[str, dict[str, Value]] = {}
     for floor, radii in found.radius.items():

@@ -8,17 +8,8 @@ from rich.table import Table
 from rich.text import Text
 
 from slipid.report.calibration import show_calibration
-from slipid.report.page import (
-    Groups,
-    Page,
-    counted,
-    grouped,
-    in_two_lines,
-    interval,
-    rounded,
-    table,
-    verdict,
-)
+from slipid.report.numbers import interval, rounded
+from slipid.report.page import Groups, Page, counted, grouped, in_two_lines, table, verdict
 from slipid.support.content import Content
 
 if TYPE_CHECKING:

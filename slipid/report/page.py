@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
-from math import ceil, floor, isfinite, log10
 from typing import TypeVar
 
 from rich.console import Console
@@ -156,24 +155,6 @@ def _split(path: str) -> tuple[str, str]:
     """Return the first part of a parameter's path, and its name; ratios are one group."""
     group, _, name = ("ratios", "", path) if "/" in path else path.rpartition(".")
     return group, name
-
-
-def rounded(value: float, width: float) -> str:
-    """Return a number as text, to about a hundredth of the width of its interval.
-
-    It has two to five significant digits; four if the width is 0 or not finite.
-    """
-    if not (isfinite(width) and isfinite(value)) or width <= 0 or value == 0:
-        return f"{value:.4g}"
-    digits = min(max(ceil(log10(abs(value) / width)) + 2, 2), 5)
-    if 1 <= abs(value) < 1e5:  # as many as there are before the point, without an exponent
-        digits = max(digits, floor(log10(abs(value))) + 1)
-    return f"{value:#.{digits}g}".removesuffix(".")
-
-
-def interval(ends: Sequence[float] | None) -> str:
-    """Return an interval as text, empty for None."""
-    return "" if ends is None else " .. ".join(rounded(end, ends[1] - ends[0]) for end in ends)
 
 
 def counted(names: Sequence[str], most: int = 6) -> str:

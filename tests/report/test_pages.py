@@ -10,6 +10,7 @@ import pytest
 from slipid.report.html.evidence import read_evidence
 from slipid.report.html.fit_page import write_report
 from slipid.report.html.page import REPORT
+from slipid.report.numbers import estimate
 from slipid.support.errors import DataError
 from tests.benchmarks.every_robot.drive import write
 from tests.benchmarks.every_robot.robots import ROBOTS
@@ -97,8 +98,8 @@ def test_runs_can_be_chosen_and_played_and_numbers_copied(browser, fitted):
     page.locator("#numbers .copy").click()
     page.wait_for_function("document.querySelector('#numbers .copy').textContent === 'Copied'")
     copied = page.evaluate("navigator.clipboard.readText()")
-    radius = json.loads((fitted / "identified.json").read_text())["parameters"]["motor.resistance"]
-    assert f"{radius['value']:.5g}" in copied
+    found = json.loads((fitted / "identified.json").read_text())["parameters"]["motor.resistance"]
+    assert f"motor_resistance_ohm: {estimate(found['value'], found['interval90'])}" in copied
     assert copied == page.locator("#numbers pre").inner_text()
     page.locator("select[data-of=residuals]").select_option("yaw rate [deg/s]")
     drawn = "document.querySelector('[data-figure=residuals]').layout.yaxis.title.text"

@@ -12,7 +12,8 @@ from slipid.infer.verdicts.estimates import Estimate
 from slipid.infer.verdicts.trust import Trust
 from slipid.predict.selection import FloorSelection
 from slipid.report import answers, calibration, checks, estimates
-from slipid.report.page import MOST_NOTES, WIDTH, Page, grouped, interval, rounded, table
+from slipid.report.numbers import interval, rounded
+from slipid.report.page import MOST_NOTES, WIDTH, Page, grouped, table
 
 FLOORS = ("carpet_gray", "table")
 
@@ -271,7 +272,7 @@ def test_findings_that_could_not_be_checked_are_notes():
 @pytest.mark.parametrize(
     ("number", "width", "text"),
     [
-        (5.49513, 0.0288, "5.4951"),
+        (5.49513, 0.0288, "5.495"),
         (0.0007278, 0.51, "0.00073"),
         (105.6, 2.0, "105.6"),
         (1234.5, 5000.0, "1234"),
@@ -284,6 +285,12 @@ def test_findings_that_could_not_be_checked_are_notes():
 )
 def test_numbers_have_the_digits_that_their_interval_deserves(number, width, text):
     assert rounded(number, width) == text
+
+
+def test_both_ends_of_an_interval_have_as_many_decimal_places():
+    assert interval((0.076, 0.084)) == "0.0760 .. 0.0840"
+    assert interval((0.68, 10.49), " to ") == "0.68 to 10.5"
+    assert interval((4.2e-8, 36847.0)) == "4.2e-08 .. 36847"
 
 
 def test_intervals_and_groups():

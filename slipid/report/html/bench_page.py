@@ -20,11 +20,11 @@ from slipid.report.html.blocks import (
     TableBlock,
     TextBlock,
     badge,
-    interval,
     number,
-    rounded,
+    spanned,
 )
 from slipid.report.html.page import WebPage
+from slipid.report.numbers import estimate
 from slipid.support.content import Content
 
 MOST_POINTS = 2000
@@ -74,7 +74,8 @@ def _numbers(fit: BenchFit, name: str) -> PageSection:
     for path, e in fit.parameters.items():
         if e.verdict == "fixed":
             continue
-        line = f"{path}: {number(e.value, 5)}  # [{e.unit}] {interval(e.interval90, 5)}"
+        shown = estimate(e.value, e.interval90)
+        line = f"{path}: {shown}  # [{e.unit}] {spanned(e.interval90)}"
         if e.verdict != "identified":
             line = f"# {line}; {e.verdict.replace('_', ' ')}"
         lines.append(line)
@@ -105,7 +106,7 @@ def _values(fit: BenchFit) -> PageSection:
 def _row(e: Estimate) -> Sequence[Cell]:
     known = e.prior_mean is not None and e.prior_std is not None
     prior = f"{number(e.prior_mean, 3)} ± {number(e.prior_std, 2)}" if known else ""
-    shown, ends = rounded(e.value, e.interval90)
+    shown, ends = estimate(e.value, e.interval90), spanned(e.interval90)
     return e.path, shown, e.unit, ends, prior, badge(e.verdict), e.doc
 
 

@@ -1,10 +1,10 @@
 """Blocks of which the sections of a page are made: text, tables, figures and numbers to copy."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from slipid.report.numbers import interval
 from slipid.support.content import Content
 
 Trace = dict[str, Any]
@@ -215,23 +215,9 @@ def number(value: float, digits: int = 4) -> str:
     return f"{value:.{digits}g}"
 
 
-def interval(ends: Sequence[float] | None, digits: int = 4) -> str:
+def spanned(ends: Sequence[float] | None) -> str:
     """Return an interval as text, empty for None."""
-    return "" if ends is None else f"{number(ends[0], digits)} to {number(ends[1], digits)}"
-
-
-def rounded(value: float, ends: Sequence[float] | None) -> tuple[str, str]:
-    """Return a value and its interval as text, with two digits of the interval's half width."""
-    if ends is None or not all(map(math.isfinite, ends)) or ends[0] >= ends[1]:
-        return number(value), interval(ends)
-    half = (ends[1] - ends[0]) / 2
-    places = 1 - math.floor(math.log10(half))
-    if half > abs(value) and min(map(abs, (value, *ends))) > 0:  # spread over decades
-        return number(value, 2), interval(ends, 2)
-    if places > 7 or places < -1:
-        return number(value, 3), interval(ends, 3)
-    low, high = (f"{end:.{max(places, 0)}f}" for end in ends)
-    return f"{value:.{max(places, 0)}f}", f"{low} to {high}"
+    return interval(ends, " to ")
 
 
 def enumerated(names: Sequence[str]) -> str:

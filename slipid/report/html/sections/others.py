@@ -12,12 +12,12 @@ from slipid.report.html.blocks import (
     TableBlock,
     TextBlock,
     colour,
-    interval,
     label,
-    number,
+    spanned,
 )
 from slipid.report.html.results import Results
 from slipid.report.html.sections.predictions import is_wide
+from slipid.report.numbers import estimate
 
 ERRORS = ("nominal", "calibrated", "selected")
 """Models whose errors are compared."""
@@ -109,10 +109,10 @@ def _numbers(found: Results) -> TableBlock:
 def _rows(found: Results, path: str, text: str) -> Iterator[Sequence[Cell]]:
     for floor in found.floors:
         if (own := _own(found, path.replace("*", floor))) is not None:
-            yield text, f"this robot, {floor}", number(own[0], 3), interval(own[1], 3)
+            yield text, f"this robot, {floor}", estimate(*own), spanned(own[1])
     for band in _bands(found, path):
         where = f"{band.robot}, {band.floor.replace('_', ' ')}"
-        yield text, where, number(band.value, 3), interval(band.interval90, 3)
+        yield text, where, estimate(band.value, band.interval90), spanned(band.interval90)
 
 
 def _own(found: Results, path: str) -> tuple[float, Sequence[float] | None] | None:

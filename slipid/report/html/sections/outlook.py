@@ -47,7 +47,8 @@ def trial(found: Results) -> PageSection | None:
     }
     runs = min(row["runs"] for row in t["summary"].values())
     caption = (
-        f"Medians of {runs} starts, with 90 % intervals; {t['path']} at {t['speed_m_s']:g} m/s."
+        f"Medians of {runs} starts, with 90 % intervals; path '{t['path']}' at "
+        f"{t['speed_m_s']:g} m/s."
     )
     figure = FigureBlock("trial_errors", title, title, data, layout, caption, 130 + 34 * len(names))
     rows = [
@@ -76,7 +77,7 @@ def trial(found: Results) -> PageSection | None:
         f"{plant}{site}; its floor: {t['map']}."
     )
     return PageSection(
-        "trial", "Trial of controllers", [figure, TableBlock(about, head, rows, right=head[1:])]
+        "trial", "Trial of controllers", [figure, TableBlock(about, head, rows, right=head[2:])]
     )
 
 

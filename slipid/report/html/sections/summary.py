@@ -2,7 +2,9 @@
 
 from collections.abc import Iterator, Sequence
 
+from slipid.fitting.calibration.result import Calibration
 from slipid.infer.verdicts.trust import WORDS
+from slipid.report.calibration import calibrated_values
 from slipid.report.html.blocks import (
     Badge,
     Block,
@@ -15,11 +17,11 @@ from slipid.report.html.blocks import (
     badge,
     enumerated,
     label,
-    number,
-    rounded,
+    spanned,
 )
 from slipid.report.html.figures import axis, dots
 from slipid.report.html.results import Results
+from slipid.report.numbers import estimate
 from slipid.support.content import Content
 
 MOST_NOTES = 5
@@ -202,8 +204,9 @@ def _motor_lines(found: Results) -> Iterator[str]:
 
 def _line(name: str, value: Content) -> str:
     """Return a line with a number, its interval and, if it is not good, its verdict."""
-    shown, ends = rounded(value["value"], value["interval90"])
-    comments = [ends] if value["interval90"] is not None and value["verdict"] != "fixed" else []
+    ends = value["interval90"]
+    shown = estimate(value["value"], ends)
+    comments = [spanned(ends)] if ends is not None and value["verdict"] != "fixed" else []
     if value["verdict"] != "identified":
         comments.append(value["verdict"].replace("_", " "))
     text = f"{_hidden(value)}{name}: {shown}"
@@ -251,11 +254,12 @@ def _apart(found: Results) -> TextBlock | None:
             continue
         (low, high), (a, b) = value["interval90"], other["interval90"]
         if a > high or b < low:
-            mine, its = rounded(value["value"], (low, high)), rounded(other["value"], (a, b))
+            mine = f"{estimate(value['value'], (low, high))} {value['unit']}"
+            its = estimate(other["value"], (a, b))
             out.append(
-                f"{name}: {mine[0]} {value['unit']} ({mine[1]}) by the calibrated kinematics, "
-                f"{its[0]} ({its[1]}) by the force balance. Each belongs to its own model: type in "
-                "that of the calibration; robot.json has that of the selected model"
+                f"{name}: {mine} ({spanned((low, high))}) by the calibrated kinematics, "
+                f"{its} ({spanned((a, b))}) by the force balance. Each belongs to its own model: "
+                "type in that of the calibration; robot.json has that of the selected model"
             )
     return TextBlock(out, listed=True, kind="warning") if out else None
 
@@ -276,36 +280,15 @@ def _counts(found: Results) -> str:
 
 
 def calibration_table(c: Content) -> TableBlock:
-    """Return the table of calibrated numbers."""
+    """Return the table of calibrated numbers; `c` is the section of identified.json."""
     rows: list[Sequence[Cell]] = []
-
-    def row(name: str, value: Content) -> None:
-        factor, unit = (1000.0, "mm") if value["unit"] == "m" else (1.0, value["unit"])
-        ends = [factor * end for end in value["interval90"]]
-        shown, span = rounded(factor * value["value"], ends)
-        span = "" if value["verdict"] == "fixed" else span
-        rows.append((name, shown, unit, span, badge(value["verdict"])))
-
-    steered = bool(c.get("steering"))
-    for floor, one in c["surfaces"].items():
-        radii = one["rolling_radius_m"]
-        for name, value in zip(drive_names(len(radii), steered), radii, strict=False):
-            row(f"{floor}: rolling radius {name.replace('_', ' ').strip()}".strip(), value)
-        for key in ("effective_track_m", "effective_base_m"):
-            if key in one:
-                row(f"{floor}: {'wheelbase' if steered else key[:-2].replace('_', ' ')}", one[key])
-    row("pose sensor ahead of the middle", c["pose_offset_m"][0])
-    row("pose sensor left of the middle", c["pose_offset_m"][1])
-    row("yaw of the pose sensor", c["pose_yaw_rad"])
-    row("lag of the poses", c["pose_lag_s"])
-    if c["pose_scale"]["verdict"] != "fixed":
-        row("true over logged length", c["pose_scale"])
-    for name, text in (
-        ("gyro_scale", "true over measured yaw rate"),
-        ("gyro_bias_rad_s", "bias of the gyro"),
-    ):
-        if name in c:
-            row(text, c[name])
+    for group, named in calibrated_values(Calibration.of_json(c)).items():
+        for name, value in named.items():
+            factor, unit = (1000.0, "mm") if value.unit == "m" else (1.0, value.unit)
+            ends = [factor * end for end in value.interval90]
+            span = "" if value.verdict == "fixed" else spanned(ends)
+            shown = estimate(factor * value.value, ends)
+            rows.append((f"{group}: {name}", shown, unit, span, badge(value.verdict)))
     head = ("calibrated number", "value", "unit", "90 % interval", "verdict")
     caption = "Calibrated kinematics and pose sensor: what odometry without a slip model needs."
     return TableBlock(caption, head, rows, right=("value",))
@@ -316,23 +299,20 @@ def _rows(found: Results, fixed: bool) -> Iterator[Sequence[Cell]]:
     for path, e in found.parameters.items():
         if "session_yaw" in path or (e["verdict"] == "fixed") != fixed:
             continue
-        for k, name in enumerate(e["labels"] or [""]):
-
-            def part(x: object, k: int = k, vector: bool = bool(e["labels"])) -> object:
-                return x[k] if vector and isinstance(x, list) else x
-
-            mean, std = part(e.get("prior_mean")), part(e.get("prior_std"))
-            prior = ""
-            if isinstance(mean, float) and isinstance(std, float):
-                prior = f"{number(mean, 3)} ± {number(std, 2)}"
-            shown, ends = rounded(part(e["value"]), part(e["interval90"]))  # type: ignore[arg-type]
-            if (e.get("ratio") or 0.0) > UNDETERMINED:
-                ends = "wider than the prior"
+        columns = [e.get(n) for n in ("value", "interval90", "prior_mean", "prior_std")]
+        if e["labels"]:
+            count = len(e["labels"])
+            each = zip(*(x if isinstance(x, list) else [x] * count for x in columns), strict=True)
+        else:
+            each = iter([tuple(columns)])
+        for k, (value, ends, mean, std) in enumerate(each):
+            prior = "" if mean is None or std is None else f"{mean:.3g} ± {std:.2g}"
+            wide = (e.get("ratio") or 0.0) > UNDETERMINED
             yield (
-                f"{path} [{name}]" if name else path,
-                shown,
+                f"{path} [{e['labels'][k]}]" if e["labels"] else path,
+                estimate(value, ends),
                 e["unit"],
-                ends,
+                "wider than the prior" if wide else spanned(ends),
                 prior,
                 badge(e["verdict"]) if k == 0 else Badge(""),
                 e.get("doc", "") if k == 0 else "",
