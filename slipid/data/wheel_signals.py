@@ -59,7 +59,7 @@ def readings(
 
 
 def refresh_period(
-    runs: Iterable[tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]]],
+    runs: Iterable[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]],
 ) -> float | None:
     """Return the refresh period of a sensor that is read less often than rows are logged [s].
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from math import floor, isfinite, log10
 
-
 MOST_DIGITS = 6
 """Largest number of significant digits [1]."""
 

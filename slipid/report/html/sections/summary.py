@@ -300,12 +300,11 @@ def _rows(found: Results, fixed: bool) -> Iterator[Sequence[Cell]]:
         if "session_yaw" in path or (e["verdict"] == "fixed") != fixed:
             continue
         columns = [e.get(n) for n in ("value", "interval90", "prior_mean", "prior_std")]
-        if e["labels"]:
-            count = len(e["labels"])
-            each = zip(*(x if isinstance(x, list) else [x] * count for x in columns), strict=True)
-        else:
-            each = iter([tuple(columns)])
-        for k, (value, ends, mean, std) in enumerate(each):
+        count = len(e["labels"])
+        if not count:
+            columns = [[x] for x in columns]
+        each = [x if isinstance(x, list) else [x] * count for x in columns]
+        for k, (value, ends, mean, std) in enumerate(zip(*each, strict=True)):
             prior = "" if mean is None or std is None else f"{mean:.3g} ± {std:.2g}"
             wide = (e.get("ratio") or 0.0) > UNDETERMINED
             yield (
