@@ -1,4 +1,4 @@
-"""What a notebook of the site runs first: cells of commands, without colours or progress."""
+"""Start-up code of the notebooks of the site: cells of commands, without colours or progress."""
 
 import os
 import subprocess

@@ -81,7 +81,7 @@ class ReferenceFloor:
 
 @dataclass(frozen=True, config=CLOSED)
 class ReferenceSource:
-    """Where the logs of a reference robot come from.
+    """Origin and licence of the logs of a reference robot.
 
     Attributes:
         title: what the logs are.

@@ -27,11 +27,16 @@ from slipid.fitting.calibration.result import Calibration
 from slipid.infer.fit_file import FIT, load
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
-from slipid.predict.body_path import BodyPath, contact_path, kinematic_path, measured_path
+from slipid.predict.body_path import (
+    BodyPath,
+    contact_path,
+    kinematic_path,
+    measured_path,
+    moved_to_start,
+)
 from slipid.predict.kinematics import nominal
 from slipid.predict.predictive import ForceBalance
 from slipid.predict.selection import aligned_path, calibrated_model
-from slipid.predict.slip_model import relative_to_start, turned
 from slipid.predict.slip_models import FloorModels, restored
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
@@ -239,28 +244,23 @@ def _paths(run: Runs, models: MotionModels) -> tuple[dict[str, BodyPath], list[s
     if measured is None or (sentence := incomplete_poses(run, 0)):
         notes.append(f"{sentence}; predicted paths are aligned with the measured poses")
         for name, model in kinematic.items():
-            found = aligned_path(run, 0, model.fitted.get(floor, model.model), models.seen)
-            paths[name] = BodyPath(found.time, found.pose)
+            aligned = aligned_path(run, 0, model.fitted.get(floor, model.model), models.seen)
+            paths[name] = BodyPath(aligned.time, aligned.pose)
         if selected in kinematic:
             paths["selected"] = paths[selected]
         return paths, notes
     w = replay.replay_windows(run, sensor)[0]
     begin = measured.at(w.start[:1] - w.lag).pose[0]
     for name, model in kinematic.items():
-        paths[name] = _begun(kinematic_path(model, models.seen, w), begin)
+        found = kinematic_path(model, models.seen, w)
+        pose = moved_to_start(found.pose[None], begin[None])[0]
+        paths[name] = BodyPath(found.time, pose)
     if selected in kinematic:
         model = kinematic[selected]
         paths["selected"] = kinematic_path(model, models.seen, w, models.calibration)
     elif selected is not None and models.contact is not None:
         paths["selected"] = contact_path(models.contact, w)
     return {k: p if k == "measured" else p.at(measured.time) for k, p in paths.items()}, notes
-
-
-def _begun(path: BodyPath, begin: Float[np.ndarray, "3"]) -> BodyPath:
-    """Return a path moved to another first pose: models with other pose sensors begin alike."""
-    relative = relative_to_start(path.pose)
-    place = begin[:2] + turned(begin[2], relative[:, :2])
-    return BodyPath(path.time, np.column_stack([place, begin[2] + relative[:, 2]]))
 
 
 def _floor(

@@ -108,6 +108,18 @@ def measured_path(data: Runs, run: int, robot: Robot) -> BodyPath | None:
     return BodyPath(time[picked] - lag, shown[0])
 
 
+def moved_to_start(
+    path: Float[np.ndarray, "run edge 3"], start: Float[np.ndarray, "run 3"]
+) -> Float[np.ndarray, "run edge 3"]:
+    """Return paths that are moved, as rigid bodies, to begin at other poses.
+
+    Models correct the poses by their own camera, and their starts differ by millimetres.
+    """
+    yaw = start[:, 2] - path[:, 0, 2]
+    place = turned(yaw[:, None], path[..., :2] - path[:, :1, :2]) + start[:, None, :2]
+    return np.concatenate([place, path[..., 2:] + yaw[:, None, None]], axis=-1)
+
+
 def contact_path(model: ForceBalance, w: Windows) -> BodyPath:
     """Return the path that the force balance predicts in the first run of some windows."""
     one = w.segments(np.zeros(1, int))

@@ -100,9 +100,9 @@ def test_pictures_are_left_out_with_the_reason(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with Reporter() as report:
         assert not can_draw(report)
-    told = capsys.readouterr().err
-    assert "all pictures are left out: a picture needs the package matplotlib" in told
-    assert "install it with: " in told
+    printed = capsys.readouterr().err
+    assert "all pictures are left out: a picture needs the package matplotlib" in printed
+    assert "install it with: " in printed
     monkeypatch.undo()
     with Reporter() as report:
         assert can_draw(report)
@@ -113,5 +113,6 @@ def test_suggestions_without_a_file_name_are_commands():
 
     for one in (PRIORS, common.renew(Path("out"))):
         name, *words = map(str, one.words)
-        with GROUP.commands[name].make_context(name, words):
-            pass
+        with GROUP.commands[name].make_context(name, words) as parsed:
+            assert parsed.info_name == name
+            assert not parsed.args

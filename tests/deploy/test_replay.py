@@ -60,7 +60,7 @@ def test_a_replay_is_that_of_steps_taken_one_by_one():
 
 
 def test_readings_between_the_rows_are_not_made_up():
-    """Where a log has no currents, currents that it repeats tell no more than none at all."""
+    """Repeated currents of a log without currents give the estimate without currents."""
     stale = replace(LOG, current_fresh=np.zeros((len(TIME), 3), bool))
     none = replace(LOG, current=None, current_fresh=None)
     estimator = Estimator(ROBOT)

@@ -19,7 +19,7 @@ from slipid.infer.result import Fit
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
-from slipid.predict.body_path import LEVEL, kinematic_bodies, measured_path
+from slipid.predict.body_path import LEVEL, kinematic_bodies, measured_path, moved_to_start
 from slipid.predict.kinematics import nominal
 from slipid.predict.predictive import ForceBalance
 from slipid.predict.selection import aligned_path, calibrated_model
@@ -182,20 +182,8 @@ def _replayed(models: Predictions, data: Runs) -> Iterator[_Replay]:
             measured = np.where(chosen[:, None, None], _measured(contact.robot, w), measured)
             others = of_contact if scale is None else scale
             scale = np.where(chosen[:, None, None, None], of_contact, others)
-        begun = {name: _begun(path, measured[:, 0]) for name, path in paths.items()}
+        begun = {n: moved_to_start(path, measured[:, 0]) for n, path in paths.items()}
         yield _Replay(w, begun, measured, scale)
-
-
-def _begun(
-    path: Float[np.ndarray, "run edge 3"], start: Float[np.ndarray, "run 3"]
-) -> Float[np.ndarray, "run edge 3"]:
-    """Return paths that are moved to begin at other poses.
-
-    Models correct the poses by their own camera, and their starts differ by millimetres.
-    """
-    yaw = start[:, 2] - path[:, 0, 2]
-    moved = turned(yaw[:, None], path[..., :2] - path[:, :1, :2]) + start[:, None, :2]
-    return np.concatenate([moved, path[..., 2:] + yaw[:, None, None]], axis=-1)
 
 
 def _measured(robot: Robot, w: Windows) -> Float[np.ndarray, "run edge 3"]:

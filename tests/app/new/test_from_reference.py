@@ -103,14 +103,14 @@ def test_a_reference_robot_may_answer_the_first_question():
 
 def test_a_wrong_first_answer_names_the_drives():
     answers = iter(["huskey", "omni", *["3", "60, 180, 300", "0.2", "0.05", "1", "9", "0"]])
-    said = []
+    messages = []
 
     def asker(asks: str, default: str, wrong: str) -> str:
-        said.append(wrong)
+        messages.append(wrong)
         return next(answers, "")
 
     assert ask({}, asker).robot == ""
-    assert "'huskey': no such drive" in said[1]
+    assert "'huskey': no such drive" in messages[1]
 
 
 def test_logs_do_not_change_the_drive_of_the_reference():

@@ -56,7 +56,7 @@ def _matrix(evidence: FitEvidence) -> list[Block]:
     order = np.argsort(-np.abs(rho[i, j]))
     pairs = [(names[i[n]], names[j[n]], rho[i[n], j[n]]) for n in order]
     strong = [p for p in pairs if abs(p[2]) >= STRONG]
-    told = [f"{a} and {b}: {_in_words(r)}" for a, b, r in strong[:MOST_PAIRS]]
+    pairs_in_words = [f"{a} and {b}: {_in_words(r)}" for a, b, r in strong[:MOST_PAIRS]]
     top = sorted(range(len(names)), key=lambda k: -np.sort(np.abs(rho[k]))[-2])[:MOST_NAMES]
     top.sort()
     shown = [names[k] for k in top]
@@ -85,9 +85,9 @@ def _matrix(evidence: FitEvidence) -> list[Block]:
         "correlation", title, alt, [heat], layout, caption, 160 + 19 * len(shown), minimum=620
     )
     blocks: list[Block] = []
-    if told:
+    if pairs_in_words:
         blocks.append(TextBlock(["Pairs of which the data know a combination better than each:"]))
-        blocks.append(TextBlock(told, listed=True))
+        blocks.append(TextBlock(pairs_in_words, listed=True))
     return [*blocks, figure]
 
 

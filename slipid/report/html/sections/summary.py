@@ -33,7 +33,7 @@ USE = {
     WORDS[1]: "Use it with care, and read the reasons first.",
     WORDS[2]: "Do not deploy it as it is. The calibrated lengths below may still be useful.",
 }
-"""What a result may be used for, keyed by the level of trust."""
+"""Uses of a result, keyed by the level of trust."""
 
 
 def verdict(found: Results) -> PageSection:
