@@ -9,7 +9,7 @@ from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option, 
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.app.mcap_file import McapTopic
+    from slipid.app.run_export.mcap_file import McapTopic
     from slipid.report.page import Page
 
 
@@ -45,8 +45,8 @@ def export_run(
 
     Times are those of the log; poses are earlier than logged by their lag.
     """
-    from slipid.app.mcap_file import mcap_of, require_mcap
-    from slipid.app.run_view import run_view
+    from slipid.app.run_export.mcap_file import mcap_of, require_mcap
+    from slipid.app.run_export.run_view import run_view
     from slipid.support.files import write_bytes
     from slipid.support.jax_setup import setup_jax
 

@@ -17,7 +17,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from slipid.app.config import read_config
 from slipid.app.logs import read_dataset
-from slipid.app.run_messages import _field_names
+from slipid.app.run_export.run_messages import _field_names
 from slipid.data.floor_map import from_polygons, write_map
 from slipid.data.runs import Runs
 from slipid.fitting.variances import DEGREES

@@ -1,6 +1,7 @@
 """Sections of a page, of made contents of a result folder."""
 
 import json
+import os
 
 import pytest
 
@@ -161,6 +162,15 @@ def test_a_page_has_no_section_without_content(folder):
         sections
     )
     assert all(blocks for blocks in sections.values())
+
+
+def test_results_that_are_older_than_the_fit_are_left_out(folder):
+    (folder / "design.json").write_text(json.dumps({"runs": [], "messages": []}))
+    (folder / "trial.json").write_text("not even JSON")
+    os.utime(folder / "trial.json", (1e9, 1e9))
+    found = read_results(folder)
+    assert (found.outdated, found.trial, found.design is None) == (("trial",), None, False)
+    assert "Left out, as older than the fit: trial.json" in words(page_of(folder)["data"])
 
 
 def test_a_posterior_that_has_not_converged_is_a_warning_with_the_command_to_type(folder):

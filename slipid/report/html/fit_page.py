@@ -8,14 +8,14 @@ from slipid.app.logs import log_folder
 from slipid.app.problem import read_fit_task
 from slipid.data.runs import Runs
 from slipid.infer.fit_file import FIT, load
+from slipid.infer.motion_models import MotionModels
 from slipid.infer.result import Fit
 from slipid.report.html.blocks import badge
 from slipid.report.html.evidence import EVIDENCE, FitEvidence, write_evidence
-from slipid.report.html.gather import Predictions, evidence_of_fit, evidence_of_predictions
-from slipid.report.html.page import REPORT, WebPage, write_page
+from slipid.report.html.gather import evidence_of_fit, evidence_of_runs
+from slipid.report.html.page import REPORT, WebPage, try_page, write_page
 from slipid.report.html.results import Results, read_results
 from slipid.report.html.sections import data, others, outlook, predictions, summary, wheels
-from slipid.support.errors import DataError
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -84,19 +84,15 @@ def write_calibration_report(
     report.stage("gathering what the page shows")
     task, found = done.task, done.calibration
     robot = found.seen(task.robot)
-    models = Predictions(task.dataset, found, task.robot.geometry, robot, None, done.models)
-    return _written(evidence_of_predictions(models, task.data_hash, tell=report.steps), out, report)
+    models = MotionModels.of_calibration(found, done.models, task.robot.geometry, robot)
+    evidence = evidence_of_runs(task.dataset, models, task.data_hash, tell=report.steps)
+    return _written(evidence, out, report)
 
 
 def _written(evidence: FitEvidence, out: Path, report: Reporter) -> tuple[str, ...]:
     write_evidence(evidence, out)
     report.stage("writing the page")
-    try:
-        write_report(out)
-    except DataError as error:  # a library is missing; the results are already written
-        report.line(str(error))
-        return (EVIDENCE,)
-    return REPORT, EVIDENCE
+    return *try_page(fit_page(read_results(out)), out / REPORT, report), EVIDENCE
 
 
 def write_report(out: Path) -> Path:

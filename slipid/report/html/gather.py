@@ -11,20 +11,17 @@ from scipy.special import fdtri
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, incomplete_poses
-from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.likelihood import corrected
 from slipid.fitting.variances import DEGREES
+from slipid.infer.body_path import LEVEL, kinematic_bodies, measured_path, moved_to_start
 from slipid.infer.measured_windows import MeasuredWindows, driving_torque, measured_windows
+from slipid.infer.motion_models import MotionModels
 from slipid.infer.result import Fit
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
-from slipid.predict.body_path import LEVEL, kinematic_bodies, measured_path, moved_to_start
-from slipid.predict.kinematics import nominal
-from slipid.predict.predictive import ForceBalance
-from slipid.predict.selection import aligned_path, calibrated_model
+from slipid.predict.selection import aligned_path
 from slipid.predict.slip_model import body_poses, turned
-from slipid.predict.slip_models import FloorModels
 from slipid.report.html import evidence as ev
 from slipid.support.errors import DataError
 from slipid.support.progress import Tell, silent
@@ -44,40 +41,6 @@ LEAST_SHARE = 0.3
 wheels is too uncertain."""
 
 
-@dataclass(frozen=True, eq=False)
-class Predictions:
-    """Slip models that predict the runs of a report.
-
-    Attributes:
-        data: runs on one floor each.
-        calibration: calibrated kinematics; None for a fit without them.
-        shape: geometry with the lengths of the config.
-        seen: robot with the pose sensor by which kinematic models are judged.
-        contact: force balance; None for a calibration.
-        selected: name of the selected model, keyed by floor; empty if none was selected.
-    """
-
-    data: Runs
-    calibration: Calibration | None
-    shape: Geometry
-    seen: Robot
-    contact: ForceBalance | None
-    selected: Mapping[str, str]
-
-    @property
-    def kinematic(self) -> list[FloorModels]:
-        """Kinematic models: the lengths of the config, and the calibrated ones, if any."""
-        models = [FloorModels(nominal(self.shape))]
-        if self.calibration is not None:
-            models.append(calibrated_model(self.calibration, self.shape))
-        return models
-
-    def selected_on(self, floor: str) -> str:
-        """Return the name of the model selected on a floor."""
-        usual = "calibrated" if self.contact is None else "contact"
-        return self.selected.get(floor, usual)
-
-
 def evidence_of_fit(fit: Fit, data: Runs, tell: Tell = silent) -> ev.FitEvidence:
     """Return the evidence of a fit.
 
@@ -86,31 +49,33 @@ def evidence_of_fit(fit: Fit, data: Runs, tell: Tell = silent) -> ev.FitEvidence
         data: its runs on one floor each.
         tell: function that reports the progress.
     """
-    chosen = {floor: one.model for floor, one in fit.selection.items()}
-    models = Predictions(data, fit.calibration, fit.config_shape, fit.seen, fit.contact, chosen)
     notes: list[str] = []
     dots: Mapping[str, object] = {}
     try:
         dots = _dots(fit, data)
     except DataError as error:  # a run that is too short to be cut into segments
         notes.append(f"no slip of single wheels: {error}")
-    found = evidence_of_predictions(models, fit.data_hash, notes, tell)
+    found = evidence_of_runs(data, MotionModels.of_fit(fit), fit.data_hash, notes, tell)
     return found.model_copy(update={"correlations": _correlations(fit), **dots})
 
 
-def evidence_of_predictions(
-    models: Predictions, data_hash: str, notes: Sequence[str] = (), tell: Tell = silent
+def evidence_of_runs(
+    data: Runs,
+    models: MotionModels,
+    data_hash: str,
+    notes: Sequence[str] = (),
+    tell: Tell = silent,
 ) -> ev.FitEvidence:
-    """Return the evidence of predicted runs, without that of a force balance.
+    """Return the evidence of runs on one floor each, without single wheels and correlations.
 
     `tell` reports the progress.
     """
-    data, notes = models.data, list(notes)
+    notes = list(notes)
     reasons = [incomplete_poses(data, k) for k in range(len(data))]
-    runs = _paths(models, [k for k, reason in enumerate(reasons) if reason is None], tell)
+    runs = _paths(data, models, [k for k, reason in enumerate(reasons) if reason is None], tell)
     whole = set(runs)
     for k, reason in enumerate(reasons):
-        if reason is not None and (run := _aligned(models, k)) is not None:
+        if reason is not None and (run := _aligned(data, models, k)) is not None:
             runs[k] = run
     order = sorted(runs)
     if not order:
@@ -155,30 +120,32 @@ class _Replay:
     scale: Float[np.ndarray, "run edge 2 2"] | None
 
 
-def _paths(models: Predictions, whole: Sequence[int], tell: Tell) -> dict[int, ev.RunEvidence]:
+def _paths(
+    data: Runs, models: MotionModels, whole: Sequence[int], tell: Tell
+) -> dict[int, ev.RunEvidence]:
     """Return the evidence of the runs with these indices, whose poses are whole."""
     out: dict[int, ev.RunEvidence] = {}
     if whole:
-        for done in _replayed(models, models.data.subset(whole)):
+        for done in _replayed(models, data.subset(whole)):
             for n, k in enumerate(done.w.run.tolist()):
-                out.setdefault(whole[k], _run(models, done, n, whole[k]))
+                out.setdefault(whole[k], _run(data, models, done, n, whole[k]))
             tell(len(out), len(whole))
     return out
 
 
-def _replayed(models: Predictions, data: Runs) -> Iterator[_Replay]:
+def _replayed(models: MotionModels, data: Runs) -> Iterator[_Replay]:
     """Yield predictions of some runs at a time."""
     contact, seen = models.contact, models.seen
     for w in replay.replay_windows(data, seen if contact is None else contact.robot):
         paths: dict[str, Float[np.ndarray, "run edge 3"]] = {}
         scale, measured = None, _measured(seen, w)
-        for model in models.kinematic:
-            noise = models.calibration if model.name == "calibrated" else None
-            paths[model.name], own = kinematic_bodies(model, seen, w, noise)
+        for name, model in models.kinematic.items():
+            noise = models.calibration if name == "calibrated" else None
+            paths[name], own = kinematic_bodies(model, seen, w, noise)
             scale = own if own is not None else scale
         if contact is not None:
             paths["contact"], of_contact = contact.body_paths(w)
-            chosen = np.array([models.selected_on(f) == "contact" for f in w.surface])
+            chosen = np.array([models.selected[f] == "contact" for f in w.surface])
             measured = np.where(chosen[:, None, None], _measured(contact.robot, w), measured)
             others = of_contact if scale is None else scale
             scale = np.where(chosen[:, None, None, None], of_contact, others)
@@ -197,37 +164,38 @@ def _spread(last: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, last, min(last, most) + 1).round().astype(int))
 
 
-def _run(models: Predictions, done: _Replay, n: int, k: int) -> ev.RunEvidence:
+def _run(data: Runs, models: MotionModels, done: _Replay, n: int, k: int) -> ev.RunEvidence:
     """Return the evidence of the run k, the n-th one of a replay."""
     time = np.concatenate([[0.0], np.cumsum(done.w.dt[n])])[:: done.w.parts]
     kept = _spread(len(time) - 1, MOST_POSES - 1)
     paths = {name: path[n, kept] for name, path in done.paths.items()}
     region = None if done.scale is None else _region(done.scale[n], kept)
-    return _evidence(models, k, time[kept], done.measured[n, kept], paths, region)
+    return _evidence(data, models, k, time[kept], done.measured[n, kept], paths, region)
 
 
-def _aligned(models: Predictions, k: int) -> ev.RunEvidence | None:
+def _aligned(data: Runs, models: MotionModels, k: int) -> ev.RunEvidence | None:
     """Return the evidence of a run whose poses lack coordinates; None for one without positions.
 
     Its start is not known: predicted paths are moved to the measured positions.
     """
-    data, seen = models.data, models.seen
+    seen = models.seen
     measured = measured_path(data, k, seen)
     if measured is None or len(measured.time) < 2:
         return None
     kept = _spread(len(measured.time) - 1, MOST_POSES - 1)
     time, paths = measured.time[kept], {}
     offset = np.broadcast_to(np.asarray(seen.camera.marker_place), (len(kept), 2))
-    for model in models.kinematic:
+    for name, model in models.kinematic.items():
         found = aligned_path(data, k, model.fitted.get(data.surface[k], model.model), seen)
         x, y, yaw = (np.interp(time, found.time, column) for column in found.pose.T)
         place = np.stack([x, y], axis=-1) + turned(yaw, offset)  # of the pose sensor
-        paths[model.name] = np.column_stack([place, yaw])
-    return _evidence(models, k, time - time[0], measured.pose[kept], paths, None)
+        paths[name] = np.column_stack([place, yaw])
+    return _evidence(data, models, k, time - time[0], measured.pose[kept], paths, None)
 
 
 def _evidence(
-    models: Predictions,
+    data: Runs,
+    models: MotionModels,
     k: int,
     time: Float[np.ndarray, " edge"],
     measured: Float[np.ndarray, "edge 3"],
@@ -235,7 +203,6 @@ def _evidence(
     region: ev.PointRegions | None,
 ) -> ev.RunEvidence:
     """Return the evidence of the run k with its paths."""
-    data = models.data
     heading, speed = np.degrees(data.heading[k]), data.speed[k]
     return ev.RunEvidence(
         name=data.logs[k].name,
@@ -250,7 +217,7 @@ def _evidence(
         measured=_track(measured),
         models={name: _track(path) for name, path in paths.items()},
         region=region,
-        selected=models.selected_on(data.surface[k]),
+        selected=models.selected[data.surface[k]],
     )
 
 

@@ -15,6 +15,10 @@ from slipid.support.toml_file import mapping_of, text_of
 
 RESULT = "a result of `slipid identify`"
 DRAWS = "posterior.nc"
+LATER = ("validation", "comparison", "trial", "design", "sample")
+"""Names of the commands whose results a page shows, and of their files without .json."""
+COPIED_S = 60.0
+"""Largest difference of the times of files that were copied together [s]."""
 MOST_DRAWS = 1500
 """Largest number of draws of a posterior that are shown."""
 
@@ -22,6 +26,8 @@ MOST_DRAWS = 1500
 @dataclass(frozen=True, eq=False)
 class Results:
     """Contents of the files in a result folder; None for a file that is absent.
+
+    Files that are older than the fit belong to an earlier one in the same folder, and are not read.
 
     Attributes:
         folder: the result folder.
@@ -34,6 +40,7 @@ class Results:
         draws: draws of the posterior, keyed by parameter.
         exports: names of the folders, below the result folder, that `slipid export` wrote.
         has_robot: True if the folder has robot.json.
+        outdated: names of files of an earlier fit, which are left out.
     """
 
     folder: Path
@@ -50,6 +57,7 @@ class Results:
     draws: dict[str, np.ndarray] | None
     exports: tuple[str, ...]
     has_robot: bool
+    outdated: tuple[str, ...]
 
     @property
     def parameters(self) -> Content:
@@ -103,6 +111,7 @@ def read_results(out: Path) -> Results:
             f"{out / EVIDENCE}: of other logs than {IDENTIFIED} beside it; run `slipid identify` "
             "again"
         )
+    outdated = _outdated(out)
     return Results(
         folder=out,
         drive=_drive(out / "config.toml"),
@@ -110,14 +119,11 @@ def read_results(out: Path) -> Results:
         run=run,
         fit=_maybe(out / FIT),
         evidence=evidence,
-        validation=_maybe(out / "validation.json"),
-        comparison=_maybe(out / "comparison.json"),
-        trial=_maybe(out / "trial.json"),
-        design=_maybe(out / "design.json"),
-        sample=_maybe(out / "sample.json"),
-        draws=_draws(out / DRAWS) if (out / DRAWS).exists() else None,
+        **{n: None if n in outdated else _maybe(out / f"{n}.json") for n in LATER},
+        draws=_draws(out / DRAWS) if (out / DRAWS).exists() and "sample" not in outdated else None,
         exports=tuple(sorted(p.parent.name for p in out.glob("*/SHA256SUMS"))),
         has_robot=(out / "robot.json").exists(),
+        outdated=outdated,
     )
 
 
@@ -132,6 +138,14 @@ def _content(path: Path, what: str) -> Content:
     if not isinstance(found, dict):
         raise DataError(f"{path}: expected {what}")
     return found
+
+
+def _outdated(out: Path) -> tuple[str, ...]:
+    """Return the names of later commands whose files are older than the fit."""
+    reference = out / (FIT if (out / FIT).exists() else IDENTIFIED)
+    paths = {name: out / f"{name}.json" for name in LATER}
+    since = reference.stat().st_mtime - COPIED_S
+    return tuple(n for n, path in paths.items() if path.exists() and path.stat().st_mtime < since)
 
 
 def _maybe(path: Path) -> Content | None:

@@ -113,6 +113,13 @@ def quality(found: Results) -> PageSection:
         ]
     else:
         blocks.append(TextBlock(["No file and no run was set aside."]))
+    if found.outdated:
+        names = enumerated([f"{name}.json" for name in found.outdated])
+        blocks.append(
+            TextBlock(
+                [f"Left out, as older than the fit: {names}. Run its command again."], kind="note"
+            )
+        )
     if more := ranked_notes(found)[MOST_NOTES:]:
         blocks += [TextBlock(["Further notes:"]), TextBlock(more, listed=True)]
     if evidence is not None and evidence.notes:

@@ -3,8 +3,8 @@
 import io
 from dataclasses import dataclass, replace
 
-from slipid.app.run_messages import messages
-from slipid.app.run_view import RunView
+from slipid.app.run_export.run_messages import messages
+from slipid.app.run_export.run_view import RunView
 from slipid.support.checkpoint import versions
 from slipid.support.extras import require
 

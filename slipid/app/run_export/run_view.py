@@ -23,21 +23,17 @@ from slipid.data.windows import incomplete_poses
 from slipid.deploy.deploy import ROBOT
 from slipid.deploy.floors import floor_of
 from slipid.deploy.replay import EstimatedRun, Start, estimated
-from slipid.fitting.calibration.result import Calibration
-from slipid.infer.fit_file import FIT, load
-from slipid.model.robot import Robot
-from slipid.predict import open_loop as replay
-from slipid.predict.body_path import (
+from slipid.infer.body_path import (
     BodyPath,
     contact_path,
     kinematic_path,
     measured_path,
     moved_to_start,
 )
-from slipid.predict.kinematics import nominal
-from slipid.predict.predictive import ForceBalance
-from slipid.predict.selection import aligned_path, calibrated_model
-from slipid.predict.slip_models import FloorModels, restored
+from slipid.infer.fit_file import FIT, load
+from slipid.infer.motion_models import MotionModels
+from slipid.predict import open_loop as replay
+from slipid.predict.selection import aligned_path
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.support.errors import DataError, first_names
@@ -45,33 +41,6 @@ from slipid.support.files import read_json
 from slipid.support.progress import Reporter
 
 _EXPECTED = "a result of `slipid identify`"
-
-
-@dataclass(frozen=True, eq=False)
-class MotionModels:
-    """Models of motion in a result folder.
-
-    Attributes:
-        kinematic: the models `nominal` and `calibrated`, as far as the folder has them.
-        seen: robot with the pose sensor by which they are judged.
-        contact: the fitted force balance; None in a calibration alone.
-        calibration: calibration with the noise of kinematic models; None in a fit without it.
-        selected: name of the selected model, keyed by floor.
-        currents: True if currents were fitted, so that they tell the floor.
-    """
-
-    kinematic: Mapping[str, FloorModels]
-    seen: Robot
-    contact: ForceBalance | None
-    calibration: Calibration | None
-    selected: Mapping[str, str]
-    currents: bool
-
-    def sensor(self, floor: str) -> Robot:
-        """Return the robot with the pose sensor by which the selected model is judged."""
-        if self.contact is None or self.selected.get(floor) in self.kinematic:
-            return self.seen
-        return self.contact.robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,22 +174,15 @@ def _models(out: Path, config: Config, run: Runs) -> MotionModels:
     """
     if not (out / FIT).exists():
         found, shape = read_calibration(out), shape_of(config)
-        own = calibrated_model(found.calibration, shape)
-        kinematic = {"nominal": FloorModels(nominal(shape)), "calibrated": own}
         seen = found.seen(shape, run)
-        return MotionModels(kinematic, seen, None, found.calibration, found.models, False)
+        return MotionModels.of_calibration(found.calibration, found.models, shape, seen)
     fit, log = load(out), run.logs[0]
     if log.load not in fit.robot.body.loads:
         known = ", ".join(fit.robot.body.loads)
         raise DataError(
             f"{log.name}: load set-up '{log.load}' was not identified; identified: {known}"
         )
-    learnt = {m.name: m for m in restored(fit.config_shape, dict(fit.baselines))}
-    kinematic = {name: learnt[name] for name in ("nominal", "calibrated") if name in learnt}
-    selected = dict.fromkeys(fit.robot.surfaces.labels, "contact")
-    selected |= {floor: one.model for floor, one in fit.selection.items()}
-    has_current = fit.channels.current
-    return MotionModels(kinematic, fit.seen, fit.contact, fit.calibration, selected, has_current)
+    return MotionModels.of_fit(fit)
 
 
 def _paths(run: Runs, models: MotionModels) -> tuple[dict[str, BodyPath], list[str]]:

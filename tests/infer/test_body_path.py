@@ -14,10 +14,10 @@ from scipy.stats import chi2, f
 from slipid.data.log import Log
 from slipid.data.runs import collect
 from slipid.fitting.variances import DEGREES
+from slipid.infer.body_path import BodyPath, kinematic_path, measured_path
 from slipid.model.geometry import differential
 from slipid.model.robot import build
 from slipid.predict import open_loop as replay
-from slipid.predict.body_path import BodyPath, kinematic_path, measured_path
 from slipid.predict.kinematics import nominal
 from slipid.predict.selection import aligned_path
 from slipid.predict.slip_model import path_of, turned

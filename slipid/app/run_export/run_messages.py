@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from slipid.app.run_view import RunView
+from slipid.app.run_export.run_view import RunView
 from slipid.data.floor_map import FloorMap
 from slipid.deploy.replay import EstimatedRun
-from slipid.predict.body_path import BodyPath
+from slipid.infer.body_path import BodyPath
 from slipid.robot.interface import NO_FLOOR
 
 FRAME = "map"

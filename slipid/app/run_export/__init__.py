@@ -1,0 +1,1 @@
+"""A run beside its predictions, and its file for viewers."""
