@@ -14,7 +14,7 @@ from scipy.stats import chi2, f
 from slipid.data.log import Log
 from slipid.data.runs import collect
 from slipid.fitting.variances import DEGREES
-from slipid.infer.body_path import BodyPath, kinematic_path, measured_path
+from slipid.infer.body_path import BodyPath, kinematic_path, measured_path, moved_to_start
 from slipid.model.geometry import differential
 from slipid.model.robot import build
 from slipid.predict import open_loop as replay
@@ -156,3 +156,15 @@ def test_paths_of_runs_without_all_coordinates_are_moved_to_the_measured_ones(la
     else:
         assert measured_path(data, 0, ROBOT) is None
     np.testing.assert_allclose(found.pose[:, 2], expected[:, 2], atol=5e-3)
+
+
+def test_paths_are_moved_as_rigid_bodies_to_a_start():
+    """Compositions of poses, as complex numbers, tell the same."""
+    rng = np.random.default_rng(0)
+    path, start = rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 3))
+    moved = moved_to_start(path, start)
+    np.testing.assert_allclose(moved[:, 0], start)
+    at, old = (x[..., 0] + 1j * x[..., 1] for x in (moved, path))
+    turn = np.exp(1j * (start[:, 2] - path[:, 0, 2]))[:, None]
+    np.testing.assert_allclose(at - at[:, :1], turn * (old - old[:, :1]))
+    np.testing.assert_allclose(np.diff(moved[..., 2]), np.diff(path[..., 2]))

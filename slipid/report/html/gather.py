@@ -72,7 +72,11 @@ def evidence_of_runs(
     """
     notes = list(notes)
     reasons = [incomplete_poses(data, k) for k in range(len(data))]
-    runs = _paths(data, models, [k for k, reason in enumerate(reasons) if reason is None], tell)
+    runs: dict[int, ev.RunEvidence] = {}
+    try:
+        runs = _paths(data, models, [k for k, why in enumerate(reasons) if why is None], tell)
+    except DataError as error:  # a run has too few poses to be predicted
+        notes.append(f"no paths from measured starts: {error}")
     whole = set(runs)
     for k, reason in enumerate(reasons):
         if reason is not None and (run := _aligned(data, models, k)) is not None:
