@@ -5,7 +5,9 @@ import os
 
 import pytest
 
+from slipid.app.reference_robots import reference_robot
 from slipid.report.html.blocks import CopyLines, FigureBlock, TableBlock, TextBlock
+from slipid.report.html.evidence import FitEvidence, Quarters, write_evidence
 from slipid.report.html.fit_page import fit_page
 from slipid.report.html.results import read_results
 
@@ -162,6 +164,63 @@ def test_a_page_has_no_section_without_content(folder):
         sections
     )
     assert all(blocks for blocks in sections.values())
+
+
+def driven(speeds, slope):
+    """Evidence of straight runs whose error along the motion grows with speed."""
+    runs, columns = [], {name: [] for name in Quarters.model_fields}
+    for k, speed in enumerate(speeds):
+        x = [round(250 * speed * n) for n in range(5)]
+        track = {"x_mm": x, "y_mm": [0] * 5, "yaw_mrad": [0] * 5}
+        off = {**track, "x_mm": [a + 30 * n for n, a in enumerate(x)]}
+        run = {"name": f"{k}.csv", "floor": "wood", "load": "as_built", "heading_deg": 0.0}
+        run |= {
+            "speed": speed,
+            "seconds": 1.0,
+            "rest_s": 2.0,
+            "path_m": speed,
+            "selected": "nominal",
+        }
+        regions = {"edge": [4], "angle_mrad": [0], "major_mm": [125.0 - 10 * k], "minor_mm": [5.0]}
+        run |= {"time_s": [0.25 * n for n in range(5)], "measured": track, "region": regions}
+        runs.append({**run, "models": {"nominal": off}})
+        for n in range(4):
+            error = slope * speed + 0.1 * (-1) ** n
+            row = {"run": k, "time_s": 0.25 * n, "seconds": 0.25, "speed": speed, "turn_deg_s": 0.0}
+            row |= {"heading_deg": 0.0, "along_mm_s": error, "across_mm_s": 0.0, "yaw_deg_s": 0.0}
+            for name, value in row.items():
+                columns[name].append(value)
+    shape = {"place_m": [(0.0, 0.15), (0.0, -0.15)], "angle_deg": [0.0, 0.0], "drive": [0, 1]}
+    wheels = {**shape, "radius_m": 0.05, "sideways": False}
+    return FitEvidence(data_hash="ab" * 32, wheels=wheels, runs=runs, quarters=columns)
+
+
+@pytest.mark.parametrize(
+    ("slope", "trend"),
+    [(9.0, "rises with speed on wood"), (-9.0, "falls with speed on wood"), (0.0, "no trend")],
+)
+def test_the_title_of_the_residuals_names_a_trend_where_there_is_one(folder, slope, trend):
+    write_evidence(driven((0.1, 0.2, 0.3, 0.4), slope), folder)
+    (figure,) = page_of(folder)["residuals"]
+    assert trend in figure.title
+
+
+def test_runs_that_end_inside_their_regions_are_counted(folder):
+    """Ends are 120 mm off, along regions with half axes of 125, 115, 105 and 95 mm."""
+    write_evidence(driven((0.1, 0.2, 0.3, 0.4), 0.0), folder)
+    assert "1 of 4 end inside their region" in words(page_of(folder)["paths"])
+
+
+def test_a_robot_is_not_compared_with_itself(folder):
+    robots = {row[1].partition(",")[0] for row in page_of(folder)["others"][2].rows}
+    assert {"husky", "warthog"} <= robots
+    path = folder / "run.json"
+    run = json.loads(path.read_text())
+    run["data"]["hash"] = reference_robot("husky").source.data_hash
+    path.write_text(json.dumps(run))
+    robots = {row[1].partition(",")[0] for row in page_of(folder)["others"][2].rows}
+    assert "husky" not in robots
+    assert "warthog" in robots
 
 
 def test_results_that_are_older_than_the_fit_are_left_out(folder):
