@@ -287,13 +287,9 @@ def ranking_figure(rows: Content, name: str, title: str, over: str) -> FigureBlo
     for own, label, shade in ((True, "slipid", "@orange"), (False, "others", "@blue")):
         mine = [n for n in order if n.startswith(OWN_PREFIX) is own]
         middle = [100 * ends[n][0] for n in mine]
-        trace = draw.errors(middle, mine, [0.0] * len(mine), label, shade)
-        trace["error_x"] |= {
-            "symmetric": False,
-            "array": [100 * (ends[n][2] - ends[n][0]) for n in mine],
-            "arrayminus": [100 * (ends[n][0] - ends[n][1]) for n in mine],
-        }
-        data.append(trace)
+        below = [100 * (ends[n][0] - ends[n][1]) for n in mine]
+        above = [100 * (ends[n][2] - ends[n][0]) for n in mine]
+        data.append(draw.errors(middle, mine, (below, above), label, shade))
     layout = {
         "xaxis": draw.axis(f"mean end-point error over the {over} [%]", type="log"),
         "yaxis": {"automargin": True, "categoryorder": "array", "categoryarray": order},

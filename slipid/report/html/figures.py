@@ -45,12 +45,15 @@ def band(x: Values, low: Values, high: Values, name: str, shade: str, **more: An
     }
 
 
-def errors(x: Values, y: Values, spread: Values, name: str, shade: str, **more: Any) -> Trace:
-    """Return dots with horizontal error bars of half length `spread`."""
+def errors(
+    x: Values, y: Values, spread: tuple[Values, Values], name: str, shade: str, **more: Any
+) -> Trace:
+    """Return dots with horizontal error bars; `spread` has their lengths to both sides."""
     made = dots(x, y, name, shade, **more)
     made["marker"] |= {"size": 9, "opacity": 1.0}
-    bars = {"type": "data", "array": list(spread), "color": shade, "thickness": 2, "width": 5}
-    return made | {"error_x": bars}
+    below, above = map(list, spread)
+    lengths = {"type": "data", "symmetric": False, "array": above, "arrayminus": below}
+    return made | {"error_x": lengths | {"color": shade, "thickness": 2, "width": 5}}
 
 
 def _series(x: Values, y: Values, name: str, mode: str, more: Content) -> Trace:

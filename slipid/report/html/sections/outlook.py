@@ -27,16 +27,9 @@ def trial(found: Results) -> PageSection | None:
         middle = row["closure_error_median"]
         low, high = row["interval90"]["closure_error_median"]
         shade = "@orange" if name == "encoder" else draw.SERIES[0]
-        trace = draw.dots([middle], [k], name, shade, marker={"size": 10, "opacity": 1})
-        trace["error_x"] = {
-            "type": "data",
-            "symmetric": False,
-            "array": [high - middle],
-            "arrayminus": [middle - low],
-            "color": shade,
-        }
-        trace["hovertemplate"] = "%{x:.0f} mm<extra>%{fullData.name}</extra>"
-        data.append(trace)
+        hover = "%{x:.0f} mm<extra>%{fullData.name}</extra>"
+        spread = [middle - low], [high - middle]
+        data.append(draw.errors([middle], [k], spread, name, shade, hovertemplate=hover))
     title = t["verdict"][0].upper() + t["verdict"][1:]
     layout = {
         "xaxis": draw.axis(

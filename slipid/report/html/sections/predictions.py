@@ -56,7 +56,7 @@ def _selection(found: Results, errors: Content) -> list[Block]:
             draw.errors(
                 [100 * errors[f][model] for f in mine],
                 mine,
-                spread,
+                (spread, spread),
                 label(model),
                 colour(model),
                 marker={"symbol": draw.SYMBOLS[k]},
@@ -173,7 +173,7 @@ def _ranking(content: Content) -> list[Block]:
                 draw.errors(
                     behind,
                     [label(m) for m in order],
-                    spread,
+                    (spread, spread),
                     "nats per run behind the best",
                     "@blue",
                 )
