@@ -143,7 +143,7 @@ def run(
     written = (*done.written, *write_robot(out, done.fit))
     if can_draw(report):
         written += tuple(path.name for path in _draw(done, out, report))
-    page = write_fit_report(done.fit, done.task.dataset, out, report)
+    page = write_fit_report(done.fit, done.task, out, report)
     return replace(done, written=(*page, *written))
 
 

@@ -110,7 +110,9 @@ def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> MultiFloorRuns:
     radius = float(robot.geometry.wheel_radius)
     w = _short(data, radius, float(robot.camera.lag))
     number = np.array([robot.surface_index(name) for name in floor.surfaces])
-    under = number[floor.at(wheel_places(robot, w))]
+    edges = np.asarray(lk.corrected(robot, jnp.asarray(w.pose)))
+    pose = np.stack([edges[:, 0], edges.mean(axis=1), edges[:, 1]], axis=1)
+    under = number[floor.at(wheel_places(robot, pose, w.session))]
     counts = (under == under[:, 1:2]).all(axis=(1, 2)) & _steady(w, radius)
     if not counts.any():
         raise DataError(
@@ -144,14 +146,17 @@ def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Window
     return replace(each[0], **whole)
 
 
-def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "segment time wheel 2"]:
+def wheel_places(
+    robot: Robot, pose: Float[np.ndarray, "segment time 3"], sessions: Sequence[str]
+) -> Float[np.ndarray, "segment time wheel 2"]:
     """Return positions of the wheel centres in the frame of the map [m].
 
-    The positions are those at the start, middle and end of the single window of every segment.
+    Args:
+        robot: the robot.
+        pose: poses of the marker, corrected by the robot's camera.
+        sessions: name of the session of each segment.
     """
-    edges = np.asarray(lk.corrected(robot, jnp.asarray(w.pose)))
-    pose = np.stack([edges[:, 0], edges.mean(axis=1), edges[:, 1]], axis=1)
-    session = lk.indices(robot.session_index, w.session)
+    session = lk.indices(robot.session_index, sessions)
     yaw = np.asarray(jax.vmap(robot.camera.yaw)(jnp.asarray(session)))
     heading = pose[..., 2] - yaw[:, None]
     c, s = np.cos(heading), np.sin(heading)

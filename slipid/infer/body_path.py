@@ -120,11 +120,17 @@ def moved_to_start(
     return np.concatenate([place, path[..., 2:] + yaw[:, None, None]], axis=-1)
 
 
+def times(w: Windows) -> Float[np.ndarray, " edge"]:
+    """Return the times of the measured poses of the first run, less the assumed lag [s]."""
+    passed = np.concatenate([[0.0], np.cumsum(w.dt[0])])[:: w.parts]
+    return np.asarray(w.start[0] - w.lag + passed)
+
+
 def contact_path(model: ForceBalance, w: Windows) -> BodyPath:
     """Return the path that the force balance predicts in the first run of some windows."""
     one = w.segments(np.zeros(1, int))
     pose, cov = model.body_paths(one)
-    return BodyPath(_times(one), pose[0], cov[0])
+    return BodyPath(times(one), pose[0], cov[0])
 
 
 def kinematic_path(
@@ -136,7 +142,7 @@ def kinematic_path(
     """
     one = w.segments(np.zeros(1, int))
     pose, cov = kinematic_bodies(model, seen, one, noise)
-    return BodyPath(_times(one), pose[0], None if cov is None else cov[0])
+    return BodyPath(times(one), pose[0], None if cov is None else cov[0])
 
 
 def kinematic_bodies(
@@ -164,12 +170,6 @@ def kinematic_bodies(
         motion = travelled(step, noise.nominal_base)
     of_noise = marker, _variances(noise), shared, picked, body[..., :2], motion
     return body, replay.path_covariance(seen, late, *of_noise)
-
-
-def _times(w: Windows) -> Float[np.ndarray, " edge"]:
-    """Return the times of the measured poses of the first run, less the assumed lag [s]."""
-    passed = np.concatenate([[0.0], np.cumsum(w.dt[0])])[:: w.parts]
-    return np.asarray(w.start[0] - w.lag + passed)
 
 
 def _variances(found: Calibration) -> dict[str, float]:

@@ -31,6 +31,8 @@ from slipid.fitting.variances import _cut, whitened
 from slipid.infer.fit_file import load
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.model import se2
+from slipid.report.html.evidence import read_evidence
+from slipid.report.html.sections.predictions import end_error
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
@@ -287,11 +289,12 @@ def test_wheels_stand_where_the_camera_says_less_the_marker():
     px, py = np.asarray(true.camera.marker_place)
     marker = jnp.array([x - py, y + px, heading + 0.1])
     logged = np.asarray(eqx.filter_jit(true.camera.logged)(marker))
-    found = cut.wheel_places(true, replace(w, pose=np.tile(logged, (1, 2, 1))))
+    pose = np.asarray(lk.corrected(true, jnp.tile(logged, (1, 2, 1))))
+    found = cut.wheel_places(true, pose, w.session)
     place = 0.125 * np.asarray(true.geometry.place)
     expected = np.stack([x - place[:, 1], y + place[:, 0]], 1)
-    assert found.shape == (1, 3, 3, 2)
-    np.testing.assert_allclose(found[0], np.tile(expected, (3, 1, 1)), atol=1e-6)
+    assert found.shape == (1, 2, 3, 2)
+    np.testing.assert_allclose(found[0], np.tile(expected, (2, 1, 1)), atol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -317,9 +320,9 @@ def test_windows_in_which_no_wheel_changes_floors(driven):
     assert 0 < some.counts.sum() < whole.counts.sum()
     for run, window in np.argwhere(some.counts):
         w = some.windows
-        edges = w.pose[run : run + 1, window : window + 2]
-        alone = replace(w.segments(np.array([run])), pose=edges)
-        x = cut.wheel_places(true, alone)[0, ..., 0]
+        edges = np.asarray(lk.corrected(true, jnp.asarray(w.pose[run, window : window + 2])))
+        pose = np.stack([edges[0], edges.mean(axis=0), edges[1]])
+        x = cut.wheel_places(true, pose[None], w.session[run : run + 1])[0, ..., 0]
         assert ((x > 0) == (some.floor[run, window] == true.surface_index("firm"))).all()
     w = whole.windows
     assert w.dt[whole.counts].max() < 2 * cut.LONGEST
@@ -468,6 +471,12 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     assert {"crossing.run.yaw", "crossing.process.along", "crossing.current.run"} < set(
         fit.variance
     )
+    shown = read_evidence(out / "evidence.json")
+    assert [run.map for run in shown.over_floors] == [0] * 4
+    assert (len(shown.runs), shown.maps[0].surfaces) == (12, ["soft"])
+    for one in shown.over_floors:  # they were driven on this floor
+        assert end_error(one, "contact") < 0.05 * one.path_m < 2 * end_error(one, "nominal")
+    assert "4 runs over several floors are drawn" in (out / "report.html").read_text()
     run = json.loads((out / "run.json").read_text())
     assert run["data"]["hash"] == fit.data_hash
     assert len(run["data"]["logs"]) == 16

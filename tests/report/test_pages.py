@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from slipid.report.html.evidence import read_evidence
+from slipid.report.html.evidence import MapEvidence, read_evidence, write_evidence
 from slipid.report.html.fit_page import write_report
 from slipid.report.html.page import REPORT
 from slipid.report.numbers import estimate
@@ -105,6 +105,31 @@ def test_runs_can_be_chosen_and_played_and_numbers_copied(browser, fitted):
     drawn = "document.querySelector('[data-figure=residuals]').layout.yaxis.title.text"
     assert page.evaluate(drawn) == "yaw rate [deg/s]"
     assert shown.errors == []
+
+
+def test_runs_over_several_floors_are_drawn_on_their_map(browser, fitted, tmp_path):
+    shutil.copytree(fitted, tmp_path / "out")
+    found = read_evidence(tmp_path / "out/evidence.json")
+    cells = [[0, 0, 1, 1]] * 4
+    floor = MapEvidence(surfaces=["soft", "rug"], corner_m=(-1, -1), cell_m=(0.5, 0.5), cells=cells)
+    over = [found.runs[0].model_copy(update={"map": 0, "region": None})]
+    found = found.model_copy(update={"over_floors": over, "maps": [floor]})
+    write_evidence(found, tmp_path / "out")
+    shown = Shown(browser, write_report(tmp_path / "out"), 360, "dark")
+    shown.draw_all()
+    page = shown.page
+    page.locator(".run").select_option(str(len(found.runs)))
+    assert page.locator(".run optgroup").last.get_attribute("label") == "several floors"
+    drawn = page.evaluate(
+        "(() => { const t = document.querySelector('.map').data, h = t.find(t => t.z);"
+        "return [h.z, h.text[3], h.x0, h.dx, h.y0, t.filter(t => /^floor:/.test(t.name)).length];"
+        "})()"
+    )
+    assert drawn == [cells, ["soft", "soft", "rug", "rug"], -0.75, 0.5, -0.75, 2]
+    assert "Several floors" in page.locator(".state").inner_text()
+    page.locator(".previous").click()
+    assert not page.evaluate("document.querySelector('.map').data.some(t => t.z)")
+    assert (shown.errors, shown.overflow) == ([], 0)
 
 
 def test_the_page_is_walked_by_keyboard_in_the_order_of_reading(browser, fitted):

@@ -29,9 +29,11 @@ from slipid.infer.body_path import (
     kinematic_path,
     measured_path,
     moved_to_start,
+    times,
 )
 from slipid.infer.fit_file import FIT, load
 from slipid.infer.motion_models import MotionModels
+from slipid.infer.replayed_paths import replayed_over_floors
 from slipid.predict import open_loop as replay
 from slipid.predict.selection import aligned_path
 from slipid.robot.deployed import DeployedRobot
@@ -107,14 +109,14 @@ def run_view(
         )
     report.stage("predicting")
     models = _models(out, config, run)
-    paths, why = _paths(run, models)
     floor, no_map = _floor(config, section, map_file)
+    paths, selected, why = _paths(run, models, floor)
     report.stage("estimating floors")
     estimate, unknown = _estimate(out, log, models, paths, floor if log.surface is None else None)
     if estimate is not None:
         pose, cov = (np.asarray(x) for x in (estimate.estimate.pose, estimate.estimate.covariance))
         paths["estimator"] = BodyPath(estimate.time, pose, cov[:, :2, :2], np.inf)
-    selected, shape = models.selected.get(run.surface[0]), models.seen.geometry
+    shape = models.seen.geometry
     wheels = np.asarray(shape.place) * float(shape.base_radius)
     notes += [*why, *no_map, *unknown]
     return RunView(log, state, selected, paths, estimate, floor, wheels, tuple(notes))
@@ -185,19 +187,27 @@ def _models(out: Path, config: Config, run: Runs) -> MotionModels:
     return MotionModels.of_fit(fit)
 
 
-def _paths(run: Runs, models: MotionModels) -> tuple[dict[str, BodyPath], list[str]]:
-    """Return the paths of a run, and sentences about missing ones.
+def _paths(
+    run: Runs, models: MotionModels, floor_map: FloorMap | None
+) -> tuple[dict[str, BodyPath], str | None, list[str]]:
+    """Return the paths of a run, the name of the selected model, and sentences about missing paths.
 
     Predicted paths have the times of the measured poses, from the first motion on.
     """
     floor, log = run.surface[0], run.logs[0]
+    whole, several = incomplete_poses(run, 0) is None, log.surface is None
+    if several and whole and floor_map and set(floor_map.surfaces) <= set(models.selected):
+        return *_over_floors(run, models, floor_map), []
     known, notes = floor in models.selected, []
     if not known:
-        what = "over several floors" if log.surface is None else f"on '{floor}'"
-        notes.append(
-            f"{log.name}: a run {what}, and not on one of the identified floors "
-            f"({', '.join(models.selected)}): without the paths calibrated and selected"
-        )
+        identified = ", ".join(models.selected)
+        what = f"on '{floor}', and not on one of the identified floors ({identified})"
+        if several and floor_map is None:
+            what = "over several floors without a map of them"
+        elif several and floor_map is not None:
+            on_map = ", ".join(floor_map.surfaces)
+            what = f"over several floors ({on_map}), not all of them identified ({identified})"
+        notes.append(f"{log.name}: a run {what}: without the paths calibrated and selected")
     kinematic = {name: m for name, m in models.kinematic.items() if known or name == "nominal"}
     sensor = models.sensor(floor)
     measured = measured_path(run, 0, sensor)
@@ -210,7 +220,7 @@ def _paths(run: Runs, models: MotionModels) -> tuple[dict[str, BodyPath], list[s
             paths[name] = BodyPath(aligned.time, aligned.pose)
         if selected in kinematic:
             paths["selected"] = paths[selected]
-        return paths, notes
+        return paths, selected, notes
     w = replay.replay_windows(run, sensor)[0]
     begin = measured.at(w.start[:1] - w.lag).pose[0]
     for name, model in kinematic.items():
@@ -222,7 +232,26 @@ def _paths(run: Runs, models: MotionModels) -> tuple[dict[str, BodyPath], list[s
         paths["selected"] = kinematic_path(model, models.seen, w, models.calibration)
     elif selected is not None and models.contact is not None:
         paths["selected"] = contact_path(models.contact, w)
-    return {k: p if k == "measured" else p.at(measured.time) for k, p in paths.items()}, notes
+    return _at_measured(paths), selected, notes
+
+
+def _over_floors(
+    run: Runs, models: MotionModels, floor: FloorMap
+) -> tuple[dict[str, BodyPath], str]:
+    """Return the paths of a run over several floors, and the name of the selected model."""
+    done = next(replayed_over_floors(models, run, floor))
+    paths = {name: BodyPath(times(done.w), path[0]) for name, path in done.paths.items()}
+    measured = measured_path(run, 0, models.sensor(run.surface[0]))
+    assert measured is not None  # its poses are whole
+    paths |= {"measured": measured, "selected": paths[done.selected[0]]}
+    paths.pop("contact", None)
+    return _at_measured(paths), done.selected[0]
+
+
+def _at_measured(paths: Mapping[str, BodyPath]) -> dict[str, BodyPath]:
+    """Return the paths at the times of the measured poses."""
+    time = paths["measured"].time
+    return {name: path if name == "measured" else path.at(time) for name, path in paths.items()}
 
 
 def _floor(

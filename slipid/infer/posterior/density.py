@@ -236,12 +236,12 @@ def electric_given_motion(
     first: Density,
     second: Density,
     covariance: Square,
-    x: Float[np.ndarray, "ensemble draw size"],
+    x: Float[np.ndarray, "ensemble draw motion"],
     seed: int,
-) -> tuple[Float[np.ndarray, "ensemble draw size"], Bool[np.ndarray, "draw proposal"]]:
+) -> tuple[Float[np.ndarray, "ensemble draw electric"], Bool[np.ndarray, "each proposal"]]:
     """Return draws of the electric parameters, one for every draw of the motion.
 
-    The second result is a mask of the accepted proposals.
+    The second result is a mask of the accepted proposals of every draw, ensemble by ensemble.
 
     Args:
         first: density of the motion.

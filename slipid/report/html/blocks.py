@@ -138,11 +138,13 @@ class Player:
 
     Attributes:
         runs: content of each run.
+        maps: content of each floor map on which runs are drawn.
         models: labels of the models, keyed by their names.
         alt: description for people who do not see the paths.
     """
 
     runs: Sequence[Content]
+    maps: Sequence[Content]
     models: Mapping[str, str]
     alt: str
     block: str = field(default="player", init=False)

@@ -49,11 +49,29 @@ class PointRegions(_Record):
     angle_mrad: list[int]
 
 
+class MapEvidence(_Record):
+    """MapEvidence of a floor map: its cells, of which a large map keeps evenly spaced ones.
+
+    Attributes:
+        surfaces: names of the surfaces.
+        corner_m: x, y of the corner with the lowest coordinates [m].
+        cell_m: length of the cells in x and in y [m].
+        cells: index in `surfaces` of each cell, row by row from the lowest y.
+    """
+
+    surfaces: list[str]
+    corner_m: tuple[float, float]
+    cell_m: tuple[float, float]
+    cells: list[list[int]]
+
+
 class RunEvidence(_Record):
     """A run with its measured and predicted paths.
 
     Attributes:
-        name, floor, load: name of the run, its floor and its load set-up.
+        name, floor, load: name of the run, its floor and its load set-up. The floor of a run over
+            several floors is that of most of its windows.
+        map: index of the map of a run over several floors; None for a run on one floor.
         heading_deg: commanded direction of travel [deg], None if unknown.
         speed: commanded speed [m/s], None if unknown.
         seconds: duration from the first motion on [s].
@@ -62,13 +80,14 @@ class RunEvidence(_Record):
         time_s: time of each pose [s].
         measured: measured poses.
         models: predicted poses, keyed by model; all begin at the first measured pose.
-        region: regions of the model that was selected on the floor.
+        region: regions of the model that was selected on the floor, None if unknown.
         selected: name of this model.
     """
 
     name: str
     floor: str
     load: str
+    map: int | None = None
     heading_deg: float | None
     speed: float | None
     seconds: float
@@ -178,7 +197,9 @@ class FitEvidence(_Record):
         schema_: name and version of the format.
         data_hash: hash of the logs, which run.json and identified.json repeat.
         wheels: wheels of the robot.
-        runs: runs with their paths; empty if poses lack coordinates.
+        runs: runs on one floor each, with their paths; empty if poses lack coordinates.
+        over_floors: runs over several floors, with their paths.
+        maps: floor maps of these runs.
         quarters: quarters of the runs.
         slip: slip and torque of the wheels, None for a calibration without a force balance.
         currents: motor currents, None if they are not logged or no force balance was fitted.
@@ -190,6 +211,8 @@ class FitEvidence(_Record):
     data_hash: str
     wheels: WheelLayout
     runs: list[RunEvidence]
+    over_floors: list[RunEvidence] = []
+    maps: list[MapEvidence] = []
     quarters: Quarters
     slip: WheelDots | None = None
     currents: CurrentDots | None = None

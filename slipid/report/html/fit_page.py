@@ -5,8 +5,7 @@ from pathlib import Path
 from slipid.app.calibrate import CalibrationResult
 from slipid.app.config import read_config
 from slipid.app.logs import log_folder
-from slipid.app.problem import read_fit_task
-from slipid.data.runs import Runs
+from slipid.app.problem import FitTask, read_fit_task
 from slipid.infer.fit_file import FIT, load
 from slipid.infer.motion_models import MotionModels
 from slipid.infer.result import Fit
@@ -61,17 +60,18 @@ def _lead(found: Results) -> str:
     return f"{what} from {runs} runs on {len(floors)} {plural}: {', '.join(floors)}."
 
 
-def write_fit_report(fit: Fit, runs: Runs, out: Path, report: Reporter) -> tuple[str, ...]:
+def write_fit_report(fit: Fit, task: FitTask, out: Path, report: Reporter) -> tuple[str, ...]:
     """Write the evidence of a fit and its page; return the names of the files.
 
     Args:
         fit: the fit, whose other files are in the folder.
-        runs: its runs on one floor each.
+        task: the runs of the fit.
         out: folder to write to.
         report: reporter of the progress.
     """
     report.stage("gathering what the page shows")
-    return _written(evidence_of_fit(fit, runs, report.steps), out, report)
+    found = evidence_of_fit(fit, task.dataset, task.mixed, report.steps)
+    return _written(found, out, report)
 
 
 def write_calibration_report(
@@ -123,6 +123,6 @@ def renew(out: Path, logs: Path | None, report: Reporter) -> Path:
         folder = log_folder(out, logs)
         task = read_fit_task(read_config(out / "config.toml"), folder, report)
         report.stage("gathering what the page shows")
-        write_evidence(evidence_of_fit(fit, task.dataset, report.steps), out)
+        write_evidence(evidence_of_fit(fit, task.dataset, tell=report.steps), out)
     report.stage("writing the page")
     return write_report(out)

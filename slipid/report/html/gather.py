@@ -1,33 +1,32 @@
 """Gathering of the evidence of a fit, or of a calibration, from its runs."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import fdtri
 
+from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
-from slipid.data.windows import Windows, incomplete_poses
-from slipid.fitting.likelihood import corrected
+from slipid.data.windows import incomplete_poses
 from slipid.fitting.variances import DEGREES
-from slipid.infer.body_path import LEVEL, kinematic_bodies, measured_path, moved_to_start
+from slipid.infer.body_path import LEVEL, measured_path
 from slipid.infer.measured_windows import MeasuredWindows, driving_torque, measured_windows
 from slipid.infer.motion_models import MotionModels
+from slipid.infer.replayed_paths import ReplayedPaths, replayed, replayed_over_floors
 from slipid.infer.result import Fit
 from slipid.model.geometry import Geometry
-from slipid.model.robot import Robot
-from slipid.predict import open_loop as replay
 from slipid.predict.selection import aligned_path
-from slipid.predict.slip_model import body_poses, turned
+from slipid.predict.slip_model import turned
 from slipid.report.html import evidence as ev
 from slipid.support.errors import DataError
 from slipid.support.progress import Tell, silent
 
 MOST_POSES, MOST_REGIONS = 65, 12
 """Largest numbers of poses, and of regions, that are kept of a run."""
+MOST_CELLS = 100
+"""Largest number of rows, and of columns, that are kept of a floor map."""
 MOST_DOTS = 6000
 """Largest number of segments whose wheels become dots; of more, evenly spaced ones are kept."""
 QUARTERS = 4
@@ -41,12 +40,15 @@ LEAST_SHARE = 0.3
 wheels is too uncertain."""
 
 
-def evidence_of_fit(fit: Fit, data: Runs, tell: Tell = silent) -> ev.FitEvidence:
+def evidence_of_fit(
+    fit: Fit, data: Runs, mixed: Sequence[tuple[Runs, FloorMap]] = (), tell: Tell = silent
+) -> ev.FitEvidence:
     """Return the evidence of a fit.
 
     Args:
         fit: the fit, which may have been loaded from its files.
         data: its runs on one floor each.
+        mixed: sets of runs over several floors, each with the map of the floors.
         tell: function that reports the progress.
     """
     notes: list[str] = []
@@ -55,8 +57,12 @@ def evidence_of_fit(fit: Fit, data: Runs, tell: Tell = silent) -> ev.FitEvidence
         dots = _dots(fit, data)
     except DataError as error:  # a run that is too short to be cut into segments
         notes.append(f"no slip of single wheels: {error}")
-    found = evidence_of_runs(data, MotionModels.of_fit(fit), fit.data_hash, notes, tell)
-    return found.model_copy(update={"correlations": _correlations(fit), **dots})
+    models = MotionModels.of_fit(fit)
+    over, lost = _over_floors(models, mixed)
+    found = evidence_of_runs(data, models, fit.data_hash, [*notes, *lost], tell)
+    maps = [_map(floor) for _, floor in mixed]
+    more = {"over_floors": over, "maps": maps, "correlations": _correlations(fit), **dots}
+    return found.model_copy(update=more)
 
 
 def evidence_of_runs(
@@ -106,61 +112,17 @@ def _wheels(shape: Geometry) -> ev.WheelLayout:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Replay:
-    """Predicted paths of the body in some runs.
-
-    Attributes:
-        w: windows of the runs, one segment each.
-        paths: predicted poses (run, edge, 3) of every model, keyed by its name.
-        measured: measured poses (run, edge, 3), by the camera of the selected model.
-        scale: scale matrices (run, edge, 2, 2) of the selected model's positions [m^2]; None if
-            there are none.
-    """
-
-    w: Windows
-    paths: Mapping[str, Float[np.ndarray, "run edge 3"]]
-    measured: Float[np.ndarray, "run edge 3"]
-    scale: Float[np.ndarray, "run edge 2 2"] | None
-
-
 def _paths(
     data: Runs, models: MotionModels, whole: Sequence[int], tell: Tell
 ) -> dict[int, ev.RunEvidence]:
     """Return the evidence of the runs with these indices, whose poses are whole."""
     out: dict[int, ev.RunEvidence] = {}
     if whole:
-        for done in _replayed(models, data.subset(whole)):
+        for done in replayed(models, data.subset(whole)):
             for n, k in enumerate(done.w.run.tolist()):
                 out.setdefault(whole[k], _run(data, models, done, n, whole[k]))
             tell(len(out), len(whole))
     return out
-
-
-def _replayed(models: MotionModels, data: Runs) -> Iterator[_Replay]:
-    """Yield predictions of some runs at a time."""
-    contact, seen = models.contact, models.seen
-    for w in replay.replay_windows(data, seen if contact is None else contact.robot):
-        paths: dict[str, Float[np.ndarray, "run edge 3"]] = {}
-        scale, measured = None, _measured(seen, w)
-        for name, model in models.kinematic.items():
-            noise = models.calibration if name == "calibrated" else None
-            paths[name], own = kinematic_bodies(model, seen, w, noise)
-            scale = own if own is not None else scale
-        if contact is not None:
-            paths["contact"], of_contact = contact.body_paths(w)
-            chosen = np.array([models.selected[f] == "contact" for f in w.surface])
-            measured = np.where(chosen[:, None, None], _measured(contact.robot, w), measured)
-            others = of_contact if scale is None else scale
-            scale = np.where(chosen[:, None, None, None], of_contact, others)
-        begun = {n: moved_to_start(path, measured[:, 0]) for n, path in paths.items()}
-        yield _Replay(w, begun, measured, scale)
-
-
-def _measured(robot: Robot, w: Windows) -> Float[np.ndarray, "run edge 3"]:
-    """Return the measured poses of the body, corrected by a robot's camera."""
-    pose = np.asarray(corrected(robot, jnp.asarray(w.pose)))
-    return body_poses(robot, w.session, pose)[:, :: w.parts]
 
 
 def _spread(last: int, most: int) -> np.ndarray:
@@ -168,13 +130,45 @@ def _spread(last: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, last, min(last, most) + 1).round().astype(int))
 
 
-def _run(data: Runs, models: MotionModels, done: _Replay, n: int, k: int) -> ev.RunEvidence:
+def _over_floors(
+    models: MotionModels, mixed: Sequence[tuple[Runs, FloorMap]]
+) -> tuple[list[ev.RunEvidence], list[str]]:
+    """Return the evidence of runs over several floors, and sentences on what it lacks."""
+    out: list[ev.RunEvidence] = []
+    notes: list[str] = []
+    for number, (data, floor) in enumerate(mixed):
+        runs: dict[int, ev.RunEvidence] = {}
+        try:
+            for done in replayed_over_floors(models, data, floor):
+                for n, k in enumerate(done.w.run.tolist()):
+                    if k not in runs:
+                        one = _run(data, models, done, n, k)
+                        runs[k] = one.model_copy(update={"map": number})
+        except DataError as error:  # a run has too few poses, or poses that lack a coordinate
+            notes.append(f"no paths over several floors: {error}")
+        out += [runs[k] for k in sorted(runs)]
+    return out, notes
+
+
+def _map(floor: FloorMap) -> ev.MapEvidence:
+    rows, columns = (_spread(n - 1, MOST_CELLS - 1) for n in floor.cells.shape)
+    low_x, low_y, high_x, high_y = floor.extent
+    return ev.MapEvidence(
+        surfaces=list(floor.surfaces),
+        corner_m=(low_x, low_y),
+        cell_m=((high_x - low_x) / len(columns), (high_y - low_y) / len(rows)),
+        cells=floor.cells[np.ix_(rows, columns)].tolist(),
+    )
+
+
+def _run(data: Runs, models: MotionModels, done: ReplayedPaths, n: int, k: int) -> ev.RunEvidence:
     """Return the evidence of the run k, the n-th one of a replay."""
     time = np.concatenate([[0.0], np.cumsum(done.w.dt[n])])[:: done.w.parts]
     kept = _spread(len(time) - 1, MOST_POSES - 1)
     paths = {name: path[n, kept] for name, path in done.paths.items()}
     region = None if done.scale is None else _region(done.scale[n], kept)
-    return _evidence(data, models, k, time[kept], done.measured[n, kept], paths, region)
+    measured, selected = done.measured[n, kept], done.selected[n]
+    return _evidence(data, models, k, time[kept], measured, paths, region, selected)
 
 
 def _aligned(data: Runs, models: MotionModels, k: int) -> ev.RunEvidence | None:
@@ -194,7 +188,8 @@ def _aligned(data: Runs, models: MotionModels, k: int) -> ev.RunEvidence | None:
         x, y, yaw = (np.interp(time, found.time, column) for column in found.pose.T)
         place = np.stack([x, y], axis=-1) + turned(yaw, offset)  # of the pose sensor
         paths[name] = np.column_stack([place, yaw])
-    return _evidence(data, models, k, time - time[0], measured.pose[kept], paths, None)
+    selected = models.selected[data.surface[k]]
+    return _evidence(data, models, k, time - time[0], measured.pose[kept], paths, None, selected)
 
 
 def _evidence(
@@ -205,6 +200,7 @@ def _evidence(
     measured: Float[np.ndarray, "edge 3"],
     paths: Mapping[str, Float[np.ndarray, "edge 3"]],
     region: ev.PointRegions | None,
+    selected: str,
 ) -> ev.RunEvidence:
     """Return the evidence of the run k with its paths."""
     heading, speed = np.degrees(data.heading[k]), data.speed[k]
@@ -221,7 +217,7 @@ def _evidence(
         measured=_track(measured),
         models={name: _track(path) for name, path in paths.items()},
         region=region,
-        selected=models.selected[data.surface[k]],
+        selected=selected,
     )
 
 

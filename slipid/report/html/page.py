@@ -98,7 +98,11 @@ def _content(sections: Iterable[PageSection]) -> Content:
     blocks = [block for section in sections for block in section.blocks]
     return {
         "figures": {b.name: b.drawn for b in blocks if isinstance(b, FigureBlock)},
-        "players": [{"runs": b.runs, "models": b.models} for b in blocks if isinstance(b, Player)],
+        "players": [
+            {"runs": b.runs, "maps": b.maps, "models": b.models}
+            for b in blocks
+            if isinstance(b, Player)
+        ],
     }
 
 

@@ -100,17 +100,46 @@ for (const select of document.querySelectorAll("select[data-of]")) {
   select.addEventListener("change", () => draw(document.querySelector(`.plot[data-figure="${select.dataset.of}"]`)));
 }
 
+// The floors of a map as an image below paths, and a marker of each for the legend.
+const FLOOR_TINTS = [["yellow", 0.16], ["sky", 0.34], ["purple", 0.3], ["muted", 0.3]];
+function floorTraces(map) {
+  const tints = map.surfaces.map((_, k) => {
+    const [name, alpha] = FLOOR_TINTS[k % FLOOR_TINTS.length];
+    const rgb = colours()[name].match(/\w\w/g).map((hex) => parseInt(hex, 16));
+    return `rgba(${rgb}, ${alpha / (1 + Math.floor(k / FLOOR_TINTS.length))})`;
+  });
+  const steps = tints.flatMap((tint, k) => [[k / tints.length, tint], [(k + 1) / tints.length, tint]]);
+  const image = {
+    type: "heatmap", z: map.cells, text: map.cells.map((row) => row.map((k) => map.surfaces[k])),
+    x0: map.corner[0] + map.cell[0] / 2, dx: map.cell[0], y0: map.corner[1] + map.cell[1] / 2, dy: map.cell[1],
+    colorscale: steps, zmin: -0.5, zmax: tints.length - 0.5, showscale: false, hovertemplate: "%{text}<extra></extra>",
+  };
+  const marks = map.surfaces.map((name, k) => ({
+    x: [null], y: [null], mode: "markers", name: `floor: ${name}`, hoverinfo: "skip",
+    marker: { symbol: "square", size: 12, color: tints[k], line: { width: 1, color: colours().muted } },
+  }));
+  return [image, ...marks];
+}
+
+// The ranges of axes that show all tracks with a margin.
+function ranges(tracks) {
+  const spans = [0, 1].map((k) => tracks.flatMap((track) => [Math.min(...track[k]), Math.max(...track[k])]));
+  const ends = spans.map((of) => [Math.min(...of) / 1000, Math.max(...of) / 1000]);
+  const margin = 0.1 + 0.1 * Math.max(...ends.map(([low, high]) => high - low));
+  return ends.map(([low, high]) => [low - margin, high + margin]);
+}
+
 // Paths of runs.
+const groupOf = (run) => (run.map === null ? run.floor : "several floors");
 class Player {
-  constructor(box, { runs, models }) {
-    Object.assign(this, { box, runs, models, timer: null });
+  constructor(box, { runs, maps, models }) {
+    Object.assign(this, { box, runs, maps, models, timer: null });
     for (const name of ["run", "time", "play", "state", "map", "off"]) this[name] = box.querySelector(`.${name}`);
-    const floors = [...new Set(runs.map((run) => run.floor))];
-    for (const floor of floors) {
+    for (const floor of new Set(runs.map(groupOf))) {
       const group = document.createElement("optgroup");
       group.label = floor;
       runs.forEach((run, k) => {
-        if (run.floor === floor) group.append(new Option(`${run.name} (ends ${run.error} mm off)`, k));
+        if (groupOf(run) === floor) group.append(new Option(`${run.name} (ends ${run.error} mm off)`, k));
       });
       this.run.append(group);
     }
@@ -161,9 +190,12 @@ class Player {
     }
     traces.push({ x: [], y: [], mode: "lines", fill: "toself", name: "90 % region", hoverinfo: "skip",
       showlegend: Boolean(run.region), line: { color: c.blue, width: 1 }, opacity: 0.5 });
+    const map = run.map === null ? null : this.maps[run.map];
+    if (map) traces.push(...floorTraces(map));
+    const [x, y] = map ? ranges(this.lines.map((line) => line.track)) : [null, null];
     const layout = laidOut({
-      xaxis: { title: { text: "x [m]" }, automargin: true },
-      yaxis: { title: { text: "y [m]" }, scaleanchor: "x", automargin: true }, showlegend: true,
+      xaxis: { title: { text: "x [m]" }, automargin: true, range: x },
+      yaxis: { title: { text: "y [m]" }, scaleanchor: "x", automargin: true, range: y }, showlegend: true,
     }, 480, traces, this.map.clientWidth);
     this.map.style.height = `${layout.height}px`;
     this.drawn = Plotly.react(this.map, traces, layout, CONFIG);
@@ -203,7 +235,7 @@ class Player {
       return `${line.label} ${mm[k].toFixed(0)} mm${heading}`;
     });
     const speed = run.speed === null ? "" : `, commanded ${run.speed} m/s`;
-    this.state.textContent = `${run.floor}, load ${run.load}${speed}: ${run.path.toFixed(2)} m. ` +
+    this.state.textContent = `${run.map === null ? run.floor : "Several floors"}, load ${run.load}${speed}: ${run.path.toFixed(2)} m. ` +
       `After ${run.time[k].toFixed(1)} s off by: ${errors.join(", ")}.`;
   }
 

@@ -18,7 +18,7 @@ from slipid.report.html.blocks import (
     enumerated,
     label,
 )
-from slipid.report.html.evidence import Quarters, RunEvidence, Track
+from slipid.report.html.evidence import MapEvidence, Quarters, RunEvidence, Track
 from slipid.report.html.results import Results
 from slipid.report.html.sections.summary import percent
 from slipid.support.content import Content
@@ -211,22 +211,38 @@ def _ranking(content: Content) -> list[Block]:
 def paths(found: Results) -> PageSection | None:
     """Return the section in which the path of any run can be played."""
     evidence = found.evidence
-    if evidence is None or not evidence.runs:
+    shown = [] if evidence is None else [*evidence.runs, *evidence.over_floors]
+    if evidence is None or not shown:
         notes = [] if evidence is None else evidence.notes
         return PageSection("paths", "Paths", [TextBlock(notes, kind="note")]) if notes else None
-    names = list(dict.fromkeys(m for run in evidence.runs for m in run.models))
-    runs = [_played(run) for run in evidence.runs]
+    names = list(dict.fromkeys(m for run in shown for m in run.models))
     about = (
         "Every run of the fit, predicted from its first pose and the wheels alone, as if it were "
         "the only run of its session. The ellipse is the 90 % region of the selected model. These "
         f"runs were fitted: the errors of held-out runs are above.{_inside(evidence.runs)}"
     )
+    if evidence.over_floors:
+        about += (
+            f" {len(evidence.over_floors)} runs over several floors are drawn on their map, from "
+            "which the models take the floor under each wheel; they have no region."
+        )
     alt = (
         "Measured path of a run, and its predictions by the config's lengths, by calibrated "
         "kinematics and by the selected model, on the floor seen from above."
     )
-    blocks: list[Block] = [TextBlock([about]), Player(runs, {m: label(m) for m in names}, alt)]
-    return PageSection("paths", "Play a run", blocks)
+    runs, maps = [_played(run) for run in shown], [_drawn(each) for each in evidence.maps]
+    player = Player(runs, maps, {m: label(m) for m in names}, alt)
+    return PageSection("paths", "Play a run", [TextBlock([about]), player])
+
+
+def _drawn(floor: MapEvidence) -> Content:
+    """Return the content of a floor map from which the page draws it."""
+    return {
+        "surfaces": floor.surfaces,
+        "corner": floor.corner_m,
+        "cell": floor.cell_m,
+        "cells": floor.cells,
+    }
 
 
 def _inside(runs: Sequence[RunEvidence]) -> str:
@@ -250,6 +266,7 @@ def _played(run: RunEvidence) -> Content:
         "name": run.name,
         "floor": run.floor,
         "load": run.load,
+        "map": run.map,
         "speed": run.speed,
         "heading": run.heading_deg,
         "path": run.path_m,
