@@ -320,7 +320,8 @@ def test_windows_in_which_no_wheel_changes_floors(driven):
     assert 0 < some.counts.sum() < whole.counts.sum()
     for run, window in np.argwhere(some.counts):
         w = some.windows
-        edges = np.asarray(lk.corrected(true, jnp.asarray(w.pose[run, window : window + 2])))
+        logged = jnp.asarray(w.pose[run : run + 1, window : window + 2])
+        edges = np.asarray(lk.corrected(true, logged))[0]
         pose = np.stack([edges[0], edges.mean(axis=0), edges[1]])
         x = cut.wheel_places(true, pose[None], w.session[run : run + 1])[0, ..., 0]
         assert ((x > 0) == (some.floor[run, window] == true.surface_index("firm"))).all()
