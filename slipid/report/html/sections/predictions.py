@@ -262,12 +262,14 @@ def _inside(runs: Sequence[RunEvidence]) -> str:
 def _played(run: RunEvidence) -> Content:
     """Return the content of a run from which the page plays it."""
     region = None if run.region is None else run.region.model_dump()
+    # the mean command of a run in circles is far smaller than its speed
+    is_straight = run.speed is not None and run.speed * run.seconds > 0.5 * run.path_m
     return {
         "name": run.name,
         "floor": run.floor,
         "load": run.load,
         "map": run.map,
-        "speed": run.speed,
+        "speed": run.speed if is_straight else None,
         "heading": run.heading_deg,
         "path": run.path_m,
         "time": run.time_s,
