@@ -298,10 +298,10 @@ class Calibration:
 def _mm(length: Value) -> str:
     """Return a length in mm with half the width of its interval, or the reason why it has none."""
     half = 500 * (length.interval90[1] - length.interval90[0])
-    text = f"{1e3 * length.value:.4g} mm"
-    if length.verdict in ("not_identified", "fixed"):
-        return _shown(length, text)
-    return f"{text} +- {half:.0f}" if half >= 10 else f"{text} +- {half:.2g}"
+    if length.verdict in ("not_identified", "fixed") or half <= 0:
+        return _shown(length, f"{1e3 * length.value:.4g} mm")
+    places = max(0, 1 - int(np.floor(np.log10(half))))
+    return f"{1e3 * length.value:.{places}f} mm +- {half:.{places}f}"
 
 
 def _shown(value: Value, text: str) -> str:
