@@ -12,7 +12,9 @@ as not told apart. SLIPID_DRIVES names a folder that keeps the robots and finish
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,6 +22,7 @@ from slipid.lab.trial.trial import TrialOptions, trial
 from slipid.support.executor import Processes
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick
+from tests.benchmarks.record import record
 from tests.helpers.shared import invoke
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -55,6 +58,13 @@ def identified(robot: str, folder: Path) -> tuple[Path, Path]:
     return config, result
 
 
+def _apart(row: Mapping[str, Any]) -> str:
+    """Return the closure, and the difference from calibrated odometry with its standard error."""
+    apart = row["to_calibrated"]
+    gap = f"{apart['mean_difference_mm']:+.0f} +- {apart['standard_error_mm']:.0f}"
+    return f"{row['closure_error_median']:.0f} ({gap})"
+
+
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_path_closes(robot, folder):
     config, result = identified(robot, folder)
@@ -74,6 +84,9 @@ def test_every_path_closes(robot, folder):
                 f"calibrated; cross-track {row['cross_track_rmse']:4.0f} mm; "
                 f"{row['finished_share']:4.0%} finish; recovery in {row['recovery_share']:.0%}"
             )
+        closures = (round(summary[name]["closure_error_median"]) for name in ROWS[:2])
+        apart_cells = (_apart(summary[name]) for name in ROWS[2:])
+        record("every_drive", [[f"{robot}, {path}", *closures, *apart_cells]])
         with_gyro = summary["contact_gyro"]["to_encoder"]["closure_error_median"]["value"]
         apart = summary["contact"]["to_calibrated"]
         gap = apart["mean_difference_mm"] / max(apart["standard_error_mm"], 1e-9)

@@ -18,6 +18,7 @@ import pytest
 
 from slipid.predict.validation import Validation
 from tests.benchmarks.quick import QUICK
+from tests.benchmarks.record import record
 from tests.helpers.held_back import held_back
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "omni3.toml"
@@ -38,6 +39,16 @@ CASES = {
 }
 
 
+SHOWN = {
+    "selected": "selected by slipid",
+    "identified": "force balance",
+    "calibrated": "calibrated kinematics",
+    "encoder": "no slip, with the sizes that slipid fitted",
+    "nominal": "nominal sizes",
+}
+"""Models in the table of results, with their labels."""
+
+
 def errors_mm(found: Validation, model: str) -> np.ndarray:
     return np.array([1e3 * run.chord * run.models[model].endpoint_error for run in found.runs])
 
@@ -53,9 +64,13 @@ def test_ends_of_closed_paths(name: str, real_data: Path, tmp_path: Path) -> Non
     path = np.array([run.path for run in found.runs])
     for model in found.runs[0].models:
         off = errors_mm(found, model)
-        print(
-            f"{model:24}{off.mean():8.1f} mm{100 * np.mean(1e-3 * off / path):8.2f} % of the path"
-        )
+        mean, share = off.mean(), 100 * np.mean(1e-3 * off / path)
+        print(f"{model:24}{mean:8.1f} mm{share:8.2f} % of the path")
+        if model in SHOWN:
+            row = [f"runs {name}", SHOWN[model], round(mean, 1), round(share, 2)]
+            record("omni3", [row], keys=2)
+    squares = [f"runs {name}", "least squares on the same runs", case.least_squares_mm, None]
+    record("omni3", [squares], keys=2)
     mine = errors_mm(found, "identified").mean()
     assert QUICK or mine < case.least_squares_mm
     assert QUICK or mine < errors_mm(found, "encoder").mean() < errors_mm(found, "nominal").mean()

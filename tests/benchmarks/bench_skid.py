@@ -15,6 +15,7 @@ import pytest
 
 from slipid.predict.validation import FloorSummary
 from tests.benchmarks.quick import QUICK, quick
+from tests.benchmarks.record import record
 from tests.helpers.held_back import held_back
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,6 +49,17 @@ SPLITS = quick(
 )
 
 
+SHOWN = {
+    "identified": "force balance",
+    "selected": "selected by slipid",
+    "calibrated": "calibrated kinematics",
+    "effective_track": "effective track",
+    "instantaneous_centres": "instantaneous centres",
+    "nominal": "nominal",
+}
+"""Models in the table of results, with their labels."""
+
+
 def judged(split: Split, real_data: Path) -> dict[str, FloorSummary]:
     config = ROOT / "configs" / f"{split.config}.toml"
     found = held_back(config, real_data / "drive_skid", split.fitted, split.judged)
@@ -67,6 +79,11 @@ def test_runs_that_were_held_back(name, real_data):
             f"{100 * s.endpoint_error_over_path_mean:13.2f}%"
             f"{s.heading_error_median_deg:12.2f} deg{inside:>10}"
         )
+        if model in SHOWN:
+            errors = (s.endpoint_error_over_path_median, s.endpoint_error_over_path_mean)
+            cells = [*(round(100 * e, 1) for e in errors), round(s.heading_error_median_deg, 2)]
+            share = None if s.coverage90 is None else round(100 * s.coverage90)
+            record("skid_held_out", [[name, SHOWN[model], *cells, share]], keys=2)
     mine, track = found["identified"], found["effective_track"]
     assert mine.coverage90 is not None
     assert QUICK or mine.coverage90 >= 0.7

@@ -13,12 +13,15 @@ import pytest
 from slipid.data.runs import collect
 from slipid.lab.selftest.logs import SimulatedSensors, simulate_logs
 from tests.benchmarks.quick import QUICK, quick
+from tests.benchmarks.record import record
 from tests.helpers.kinds import SHAPES, fitted, known, plan, wanted
 from tests.helpers.slow_meters import held
 
 EVERY = quick((1, 4, 16), (4,))
 """Rows from one reading of the meters to the next."""
 SEEDS = quick((0, 1, 2), (0,))
+SYMBOLS = {"motor.back_emf": "C_e", "motor.resistance": "R"}
+"""Symbols of the identified constants."""
 FINE = SimulatedSensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
 
 
@@ -26,6 +29,7 @@ FINE = SimulatedSensors(ripple=0.005, current_step=0.002, voltage_step=0.005, si
 def test_what_slow_meters_tell(kind):
     print(f"\n{kind}\n{'every':>6}{'seed':>6}{'number':>20}{'off':>9}{'std':>9}{'off / std':>11}")
     worst = 0.0
+    errors: dict[tuple[int, str], list[tuple[float, float]]] = {}
     for seed in SEEDS:
         drives = plan(SHAPES[kind], 12)
         truth = known(SHAPES[kind], drives)
@@ -34,10 +38,14 @@ def test_what_slow_meters_tell(kind):
             data = collect([held(log, rows, 7 * k) for k, log in enumerate(logs)])
             fit = fitted(truth, data, wanted(truth, data))
             assert QUICK or fit.converged, fit.reason
-            for name in ("motor.back_emf", "motor.resistance"):
+            for name in SYMBOLS:
                 (entry,) = (e for e in fit.space.free if e.path == name)
                 true, found = float(entry.get(truth)), fit.parameters[name]
                 off, std = float(found.value) / true - 1.0, float(found.std) / true
                 print(f"{rows:6}{seed:6}{name:>20}{off:9.2%}{std:9.2%}{off / std:11.1f}")
                 worst = max(worst, abs(off / std))
+                errors.setdefault((rows, name), []).append((abs(off), std))
+    for (rows, name), pairs in errors.items():
+        largest, std = (round(100 * max(column), 2) for column in zip(*pairs, strict=True))
+        record("slow_meters", [[kind, SYMBOLS[name], rows, largest, std]], keys=3)
     assert QUICK or worst < 3.5
