@@ -119,6 +119,7 @@ def remarks(
             out.append(f"on {floor} one run alone: intervals come from its parts; drive several")
     out += _one_speed(task)
     radii, base = c.radius[c.firmest], c.base[c.firmest]
+    firmest = ", the firmest floor," if len(c.base) > 1 else ""
     for name, value, nominal, std in (
         ("wheel radius", _mean_radius(c), c.nominal_radius, max(v.std for v in radii)),
         (what, base.value, c.nominal_base, base.std),
@@ -132,8 +133,8 @@ def remarks(
             )
         elif abs(value - nominal) > max(FAR_FROM_CONFIG * nominal, CONTRADICTION * std):
             out.append(
-                f"the {name} in the config is {1e3 * nominal:.4g} mm; on {c.firmest} it is "
-                f"{1e3 * value:.4g} mm ({100 * (ratio - 1):+.1f} %)"
+                f"the {name} in the config is {1e3 * nominal:.4g} mm; on {c.firmest}{firmest} it "
+                f"is {1e3 * value:.4g} mm ({100 * (ratio - 1):+.1f} %)"
             )
     apart = [abs(v.value / _mean_radius(c) - 1) for row in c.radius.values() for v in row]
     effects = [max(x[:2]) for x in c.noise.effect.values()]

@@ -35,15 +35,14 @@ class ReplayedPaths:
         paths: predicted poses (x, y [m], heading [rad]) of every model, keyed by its name; they
             begin at the first measured pose.
         measured: measured poses, by the camera of the selected model.
-        selected: name of the model that was selected on the floor of each run, or on the floor of
-            most of its windows.
+        floor: name of the floor of each run, or of the floor of most of its windows.
         scale: scale matrices of the selected model's positions [m^2]; None if there are none.
     """
 
     w: Windows
     paths: Mapping[str, Paths]
     measured: Paths
-    selected: tuple[str, ...]
+    floor: tuple[str, ...]
     scale: Float[np.ndarray, "run edge 2 2"] | None
 
 
@@ -53,19 +52,18 @@ def replayed(models: MotionModels, data: Runs) -> Iterator[ReplayedPaths]:
     for w in replay.replay_windows(data, _sensor(models)):
         paths: dict[str, Paths] = {}
         scale, measured = None, _measured(seen, w)
-        selected = tuple(models.selected[floor] for floor in w.surface)
         for name, model in models.kinematic.items():
             noise = models.calibration if name == "calibrated" else None
             paths[name], own = kinematic_bodies(model, seen, w, noise)
             scale = own if own is not None else scale
         if contact is not None:
             paths["contact"], of_contact = contact.body_paths(w)
-            chosen = np.array([name == "contact" for name in selected])
+            chosen = np.array([models.selected[floor] == "contact" for floor in w.surface])
             measured = np.where(chosen[:, None, None], _measured(contact.robot, w), measured)
             others = of_contact if scale is None else scale
             scale = np.where(chosen[:, None, None, None], of_contact, others)
         begun = {n: moved_to_start(path, measured[:, 0]) for n, path in paths.items()}
-        yield ReplayedPaths(w, begun, measured, selected, scale)
+        yield ReplayedPaths(w, begun, measured, w.surface, scale)
 
 
 def replayed_over_floors(
@@ -95,11 +93,11 @@ def replayed_over_floors(
             numbers = np.array([robot.surface_index(f) for f in floor.surfaces])
             step = np.asarray(replay.contact_increments(robot, lk.batch(w, robot, numbers[under])))
             paths["contact"] = _bodies(robot, w, step)
-        measured = _measured(robot, w)
+        most = tuple(floor.surfaces[np.bincount(row).argmax()] for row in main)
+        by_sensor = (_measured(models.sensor(name), w)[n] for n, name in enumerate(most))
+        measured = np.stack(list(by_sensor))
         begun = {n: moved_to_start(path, measured[:, 0]) for n, path in paths.items()}
-        most = [floor.surfaces[np.bincount(row).argmax()] for row in main]
-        selected = tuple(models.selected[name] for name in most)
-        yield ReplayedPaths(w, begun, measured, selected, None)
+        yield ReplayedPaths(w, begun, measured, most, None)
 
 
 def _sensor(models: MotionModels) -> Robot:

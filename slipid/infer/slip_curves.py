@@ -53,6 +53,9 @@ class SlipCurve:
 
 LEAST_RANK_CORRELATION = 0.3
 """Smallest rank correlation at which measured slip rises with torque [1]."""
+LEAST_SPREAD = 0.2
+"""Smallest difference of the tenth and ninetieth percentiles of torque, over the larger of their
+magnitudes, at which slip can rise with it [1]."""
 
 
 def slip_sentence(
@@ -67,7 +70,8 @@ def slip_sentence(
 
     rises, others = [], []
     for floor, (torque, slip) in dots.items():
-        varied = len(torque) > 5 and np.ptp(torque) > 0 and np.ptp(slip) > 0
+        low, high = np.quantile(torque, [0.1, 0.9]) if len(torque) > 5 else (0.0, 0.0)
+        varied = high - low > LEAST_SPREAD * max(abs(low), abs(high)) and np.ptp(slip) > 0
         rank = float(spearmanr(torque, slip).statistic) if varied else 0.0
         (rises if rank > LEAST_RANK_CORRELATION else others).append(floor)
     if not rises:

@@ -476,6 +476,7 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     assert [run.map for run in shown.over_floors] == [0] * 4
     assert (len(shown.runs), shown.maps[0].surfaces) == (12, ["soft"])
     for one in shown.over_floors:  # they were driven on this floor
+        assert one.floor == "soft"
         assert end_error(one, "contact") < 0.05 * one.path_m < 2 * end_error(one, "nominal")
     assert "4 runs over several floors are drawn" in (out / "report.html").read_text()
     run = json.loads((out / "run.json").read_text())

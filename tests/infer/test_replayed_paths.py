@@ -36,7 +36,7 @@ def test_on_a_map_of_one_floor_they_are_those_of_runs_on_it(fitted):
         replayed(models, data),
         replayed_over_floors(models, data, uniform("soft")),
     )
-    assert mapped.selected == alone.selected
+    assert mapped.floor == alone.floor
     assert mapped.scale is None
     assert list(mapped.paths) == list(alone.paths) == ["nominal", "calibrated", "contact"]
     # only the force balance of runs on one floor has the shared effects of neighbouring runs
@@ -55,6 +55,8 @@ def test_calibrated_wheels_have_the_radii_of_the_floor_below(fitted):
     chosen = {"soft": "calibrated", "firm": "calibrated"}
     two = replace(models, contact=None, kinematic={"calibrated": both}, selected=chosen)
     (on_soft,) = replayed_over_floors(two, data, uniform("soft"))
+    (alone,) = replayed(two, data)
+    np.testing.assert_array_equal(on_soft.measured, alone.measured)  # by the same pose sensor
     line = float(np.median(on_soft.measured[0, :, 0]))  # the first run crosses it halfway
     corners = [(line, -9.0), (9.0, -9.0), (9.0, 9.0), (line, 9.0)]
     floor = from_polygons("soft", [("firm", corners)], (-3.0, -3.0, 3.0, 3.0))

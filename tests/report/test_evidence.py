@@ -6,11 +6,13 @@ from scipy.special import fdtri
 
 from slipid.app.config import read_config
 from slipid.app.problem import read_fit_task
+from slipid.data.floor_map import from_polygons
 from slipid.fitting.variances import DEGREES
 from slipid.infer.fit_file import load
 from slipid.infer.slip_curves import slip_sentence
 from slipid.predict.open_loop import replay_windows
-from slipid.report.html.evidence import read_evidence
+from slipid.report.html.evidence import RunEvidence, Track, read_evidence
+from slipid.report.html.gather import _map, _travel
 from slipid.report.html.sections.predictions import end_error
 from slipid.support.progress import Reporter
 
@@ -82,3 +84,39 @@ def test_a_title_claims_what_the_dots_show_and_nothing_else():
     assert both == "The slip of a wheel rises with its torque on soft; no rise shows on firm"
     assert "does not rise" in slip_sentence({"firm": flat})
     assert slip_sentence({"soft": rising}).endswith("on soft")
+
+
+def test_a_robot_that_turns_while_it_drives_ahead_does_not_drive_backwards():
+    yaw = np.linspace(0.0, 4.0, 17)  # an arc of 229 degrees, whose chord points back
+    path = np.column_stack([np.sin(yaw), 1 - np.cos(yaw), yaw])
+    ahead, left = _travel(path)
+    assert ahead == pytest.approx(4.0, rel=0.01)
+    assert abs(left) < 1e-9
+
+
+def test_a_map_is_cut_to_what_its_runs_need():
+    run = RunEvidence(
+        **{"name": "a", "floor": "soft", "load": "as_built", "heading_deg": None, "speed": None},
+        **{"seconds": 1.0, "rest_s": 0.0, "path_m": 1.0, "time_s": [0, 1], "models": {}},
+        measured=Track(x_mm=[1000, 2000], y_mm=[0, 0], yaw_mrad=[0, 0]),
+        region=None,
+        selected="contact",
+    )
+    corners = [(1.5, -9.0), (9.0, -9.0), (9.0, 9.0), (1.5, 9.0)]
+    whole = from_polygons("soft", [("rug", corners)], (-5.0, -5.0, 5.0, 5.0))
+    shown = _map(whole, [run])
+    assert shown.corner_m == pytest.approx((0.6, -0.4))
+    cells, cell = np.array(shown.cells), shown.cell_m[0]
+    assert cells.shape == (100, 100)
+    assert cell == pytest.approx(0.018)
+    edge = shown.corner_m[0] + cell * np.count_nonzero(cells[0] == 0)
+    assert edge == pytest.approx(1.5, abs=cell)
+    far = run.model_copy(update={"measured": Track(x_mm=[50000] * 2, y_mm=[0, 0], yaw_mrad=[0, 0])})
+    assert _map(whole, [far]).corner_m == (-5.0, -5.0)
+
+
+def test_slip_rises_with_torque_only_where_torques_differ():
+    rng = np.random.default_rng(1)
+    torque = 0.06 + 1e-4 * rng.normal(size=60)
+    assert "does not rise" in slip_sentence({"carpet": (torque, torque)})
+    assert "rises" in slip_sentence({"carpet": (torque - 0.0598, torque)})

@@ -204,6 +204,8 @@ def _paths(
         what = f"on '{floor}', and not on one of the identified floors ({identified})"
         if several and floor_map is None:
             what = "over several floors without a map of them"
+        elif several and not whole:
+            what = "over several floors whose poses lack a coordinate"
         elif several and floor_map is not None:
             on_map = ", ".join(floor_map.surfaces)
             what = f"over several floors ({on_map}), not all of them identified ({identified})"
@@ -241,11 +243,12 @@ def _over_floors(
     """Return the paths of a run over several floors, and the name of the selected model."""
     done = next(replayed_over_floors(models, run, floor))
     paths = {name: BodyPath(times(done.w), path[0]) for name, path in done.paths.items()}
-    measured = measured_path(run, 0, models.sensor(run.surface[0]))
+    measured = measured_path(run, 0, models.sensor(done.floor[0]))
     assert measured is not None  # its poses are whole
-    paths |= {"measured": measured, "selected": paths[done.selected[0]]}
+    selected = models.selected[done.floor[0]]
+    paths |= {"measured": measured, "selected": paths[selected]}
     paths.pop("contact", None)
-    return _at_measured(paths), done.selected[0]
+    return _at_measured(paths), selected
 
 
 def _at_measured(paths: Mapping[str, BodyPath]) -> dict[str, BodyPath]:

@@ -279,7 +279,10 @@ _SEVERAL = (
     "A motor that turns several wheels may have a single joint instead: then enter one name on "
     "each side."
 )
-_SEPARATION = "Distance from the left to the right wheels [m], by robot.base_radius."
+_SEPARATION = (
+    "Distance from the left to the right wheels [m], by robot.base_radius. The multipliers below "
+    "belong to it and to wheel_radius: copy all of them, not the multipliers alone."
+)
 _LIMITS = (
     "Limits of the robot: m/s, m/s^2, rad/s, rad/s^2. The largest change of the yaw rate is the "
     "largest acceleration of a rim, over half the wheel separation. Releases of ros2_controllers "

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from slipid.report.numbers import interval
 from slipid.support.content import Content
@@ -188,28 +188,55 @@ def badge(verdict: str) -> Badge:
     return Badge(verdict.replace("_", " "), VERDICTS.get(verdict, "plain"))
 
 
-MODELS: Mapping[str, tuple[str, str]] = {
-    "nominal": ("lengths of the config", "@orange"),
-    "encoder": ("fitted lengths, no slip", "@purple"),
-    "calibrated": ("calibrated kinematics", "@green"),
-    "contact": ("force balance", "@blue"),
-    "identified": ("force balance", "@blue"),
-    "selected": ("selected model", "@blue"),
-    "heading_lookup": ("lookup by heading", "@sky"),
-    "paper": ("form of the 2021 paper", "@yellow"),
-    "effective_track": ("effective track", "@sky"),
+class ModelStyle(NamedTuple):
+    """Style of a slip model in figures.
+
+    Attributes:
+        label: label of the model.
+        colour: colour of its series, a name of the theme.
+        symbol: symbol of its dots.
+        size: size of its dots [pixel].
+    """
+
+    label: str
+    colour: str = "@muted"
+    symbol: str = "x"
+    size: int = 9
+
+
+MODELS: Mapping[str, ModelStyle] = {
+    "nominal": ModelStyle("lengths of the config", "@orange", "circle"),
+    "encoder": ModelStyle("fitted lengths, no slip", "@purple", "triangle-up"),
+    "calibrated": ModelStyle("calibrated kinematics", "@green", "square"),
+    "contact": ModelStyle("force balance", "@blue", "diamond"),
+    "identified": ModelStyle("force balance", "@blue", "diamond"),
+    "selected": ModelStyle("selected model", "@ink", "circle-open", 16),
+    "heading_lookup": ModelStyle("lookup by heading", "@sky", "triangle-down"),
+    "paper": ModelStyle("form of the 2021 paper", "@yellow", "cross"),
+    "effective_track": ModelStyle("effective track", "@sky", "triangle-down"),
 }
-"""Label and colour of slip models, keyed by name."""
+"""Styles of slip models, keyed by name."""
+
+
+def style_of(model: str) -> ModelStyle:
+    """Return the style of a slip model."""
+    return MODELS.get(model, ModelStyle(model.replace("_", " ")))
 
 
 def label(model: str) -> str:
     """Return the label of a slip model."""
-    return MODELS.get(model, (model.replace("_", " "), ""))[0]
+    return style_of(model).label
 
 
 def colour(model: str) -> str:
     """Return the colour of a slip model."""
-    return MODELS.get(model, ("", "@muted"))[1]
+    return style_of(model).colour
+
+
+def marker(model: str) -> Content:
+    """Return the marker of a slip model."""
+    style = style_of(model)
+    return {"symbol": style.symbol, "size": style.size, "opacity": 1}
 
 
 def number(value: float, digits: int = 4) -> str:

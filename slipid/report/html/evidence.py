@@ -50,12 +50,12 @@ class PointRegions(_Record):
 
 
 class MapEvidence(_Record):
-    """MapEvidence of a floor map: its cells, of which a large map keeps evenly spaced ones.
+    """Evidence of a floor map: the part around the runs that are drawn on it.
 
     Attributes:
         surfaces: names of the surfaces.
-        corner_m: x, y of the corner with the lowest coordinates [m].
-        cell_m: length of the cells in x and in y [m].
+        corner_m: x, y of the corner of this part with the lowest coordinates [m].
+        cell_m: length of the cells in x and in y [m]; the cells of a large map are joined.
         cells: index in `surfaces` of each cell, row by row from the lowest y.
     """
 

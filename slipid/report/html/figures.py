@@ -65,6 +65,12 @@ def axis(title: str, **more: Any) -> Content:
     return {"title": {"text": title}, "automargin": True, **more}
 
 
+def logarithmic() -> Content:
+    """Return what makes an axis logarithmic, with whole numbers as its labels."""
+    ticks = [round(step * 10.0**power, 3) for power in range(-3, 4) for step in (1, 2, 5)]
+    return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
+
+
 def panels(count: int, titles: Sequence[str], across: int) -> tuple[Content, list[str], int]:
     """Return layout, names of the axes and number of rows of a grid of panels.
 

@@ -123,6 +123,10 @@ def renew(out: Path, logs: Path | None, report: Reporter) -> Path:
         folder = log_folder(out, logs)
         task = read_fit_task(read_config(out / "config.toml"), folder, report)
         report.stage("gathering what the page shows")
-        write_evidence(evidence_of_fit(fit, task.dataset, tell=report.steps), out)
+        found = evidence_of_fit(fit, task.dataset, tell=report.steps)
+        if any(section.map for section in task.config.content.logs):
+            note = "runs over several floors are shown after `slipid identify` alone"
+            found = found.model_copy(update={"notes": [*found.notes, note]})
+        write_evidence(found, out)
     report.stage("writing the page")
     return write_report(out)

@@ -58,9 +58,8 @@ def evidence_of_fit(
     except DataError as error:  # a run that is too short to be cut into segments
         notes.append(f"no slip of single wheels: {error}")
     models = MotionModels.of_fit(fit)
-    over, lost = _over_floors(models, mixed)
+    over, maps, lost = _over_floors(models, mixed)
     found = evidence_of_runs(data, models, fit.data_hash, [*notes, *lost], tell)
-    maps = [_map(floor) for _, floor in mixed]
     more = {"over_floors": over, "maps": maps, "correlations": _correlations(fit), **dots}
     return found.model_copy(update=more)
 
@@ -132,33 +131,58 @@ def _spread(last: int, most: int) -> np.ndarray:
 
 def _over_floors(
     models: MotionModels, mixed: Sequence[tuple[Runs, FloorMap]]
-) -> tuple[list[ev.RunEvidence], list[str]]:
-    """Return the evidence of runs over several floors, and sentences on what it lacks."""
+) -> tuple[list[ev.RunEvidence], list[ev.MapEvidence], list[str]]:
+    """Return the evidence of runs over several floors, their maps, and sentences on what it lacks.
+
+    A run whose poses lack a coordinate, or that has too few, has no evidence.
+    """
     out: list[ev.RunEvidence] = []
+    maps: list[ev.MapEvidence] = []
     notes: list[str] = []
-    for number, (data, floor) in enumerate(mixed):
-        runs: dict[int, ev.RunEvidence] = {}
-        try:
-            for done in replayed_over_floors(models, data, floor):
-                for n, k in enumerate(done.w.run.tolist()):
-                    if k not in runs:
-                        one = _run(data, models, done, n, k)
-                        runs[k] = one.model_copy(update={"map": number})
-        except DataError as error:  # a run has too few poses, or poses that lack a coordinate
-            notes.append(f"no paths over several floors: {error}")
-        out += [runs[k] for k in sorted(runs)]
-    return out, notes
+    for data, floor in mixed:
+        runs: list[ev.RunEvidence] = []
+        for k in range(len(data)):
+            one = data.subset([k])
+            try:
+                if reason := incomplete_poses(one, 0):
+                    raise DataError(reason)
+                done = next(replayed_over_floors(models, one, floor))
+            except DataError as error:
+                notes.append(f"no path over several floors: {error}")
+                continue
+            runs.append(_run(one, models, done, 0, 0).model_copy(update={"map": len(maps)}))
+        if runs:
+            maps.append(_map(floor, runs))
+            out += runs
+    return out, maps, notes
 
 
-def _map(floor: FloorMap) -> ev.MapEvidence:
-    rows, columns = (_spread(n - 1, MOST_CELLS - 1) for n in floor.cells.shape)
-    low_x, low_y, high_x, high_y = floor.extent
+def _map(floor: FloorMap, runs: Sequence[ev.RunEvidence]) -> ev.MapEvidence:
+    """Return the part of a map around some runs, with at most `MOST_CELLS` rows and columns."""
+    x, y = (
+        np.concatenate([getattr(track, axis) for run in runs for track in _tracks(run)]) / 1000.0
+        for axis in ("x_mm", "y_mm")
+    )
+    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+    margin = 0.2 + 0.2 * float((high - low).max())
+    low, high = low - margin, high + margin
+    low, high = np.maximum(low, floor.extent[:2]), np.minimum(high, floor.extent[2:])
+    if (high <= low).any():  # the runs are beside their map
+        low, high = np.array(floor.extent[:2]), np.array(floor.extent[2:])
+    count = np.clip(np.ceil((high - low) / floor.cell), 1, MOST_CELLS).astype(int)
+    cell = (high - low) / count
+    middles = (low[k] + cell[k] * (np.arange(count[k]) + 0.5) for k in range(2))
+    cells = floor.at(np.stack(np.meshgrid(*middles), axis=-1))
     return ev.MapEvidence(
         surfaces=list(floor.surfaces),
-        corner_m=(low_x, low_y),
-        cell_m=((high_x - low_x) / len(columns), (high_y - low_y) / len(rows)),
-        cells=floor.cells[np.ix_(rows, columns)].tolist(),
+        corner_m=(round(float(low[0]), 4), round(float(low[1]), 4)),
+        cell_m=(float(cell[0]), float(cell[1])),
+        cells=cells.tolist(),
     )
+
+
+def _tracks(run: ev.RunEvidence) -> tuple[ev.Track, ...]:
+    return run.measured, *run.models.values()
 
 
 def _run(data: Runs, models: MotionModels, done: ReplayedPaths, n: int, k: int) -> ev.RunEvidence:
@@ -167,8 +191,8 @@ def _run(data: Runs, models: MotionModels, done: ReplayedPaths, n: int, k: int) 
     kept = _spread(len(time) - 1, MOST_POSES - 1)
     paths = {name: path[n, kept] for name, path in done.paths.items()}
     region = None if done.scale is None else _region(done.scale[n], kept)
-    measured, selected = done.measured[n, kept], done.selected[n]
-    return _evidence(data, models, k, time[kept], measured, paths, region, selected)
+    measured, floor = done.measured[n, kept], done.floor[n]
+    return _evidence(data, models, k, time[kept], measured, paths, region, floor)
 
 
 def _aligned(data: Runs, models: MotionModels, k: int) -> ev.RunEvidence | None:
@@ -188,8 +212,8 @@ def _aligned(data: Runs, models: MotionModels, k: int) -> ev.RunEvidence | None:
         x, y, yaw = (np.interp(time, found.time, column) for column in found.pose.T)
         place = np.stack([x, y], axis=-1) + turned(yaw, offset)  # of the pose sensor
         paths[name] = np.column_stack([place, yaw])
-    selected = models.selected[data.surface[k]]
-    return _evidence(data, models, k, time - time[0], measured.pose[kept], paths, None, selected)
+    poses, floor = measured.pose[kept], data.surface[k]
+    return _evidence(data, models, k, time - time[0], poses, paths, None, floor)
 
 
 def _evidence(
@@ -200,13 +224,13 @@ def _evidence(
     measured: Float[np.ndarray, "edge 3"],
     paths: Mapping[str, Float[np.ndarray, "edge 3"]],
     region: ev.PointRegions | None,
-    selected: str,
+    floor: str,
 ) -> ev.RunEvidence:
-    """Return the evidence of the run k with its paths."""
+    """Return the evidence of the run k with its paths; `floor` is the one most driven on."""
     heading, speed = np.degrees(data.heading[k]), data.speed[k]
     return ev.RunEvidence(
         name=data.logs[k].name,
-        floor=data.surface[k],
+        floor=floor,
         load=data.logs[k].load,
         heading_deg=round(float(heading), 1) if np.isfinite(heading) else None,
         speed=round(float(speed), 3) if np.isfinite(speed) else None,
@@ -217,7 +241,7 @@ def _evidence(
         measured=_track(measured),
         models={name: _track(path) for name, path in paths.items()},
         region=region,
-        selected=selected,
+        selected=models.selected[floor],
     )
 
 
@@ -266,15 +290,15 @@ def _quarters(runs: Sequence[ev.RunEvidence | None]) -> ev.Quarters:
             path = np.linalg.norm(np.diff(measured[i : j + 1, :2], axis=0), axis=1).sum()
             chord = float(np.hypot(*moved[:2]))
             ahead = moved[:2] / chord if chord > TURNS_ON_SPOT * path else np.array([1.0, 0.0])
-            moves = chord > TURNS_ON_SPOT * path
+            travel = _travel(measured[i : j + 1])
             row = {
                 "run": k,
                 "time_s": round(0.5 * (run.time_s[i] + run.time_s[j]), 2),
                 "seconds": round(seconds, 2),
                 "speed": round(float(path) / seconds, 3),
                 "turn_deg_s": round(float(np.degrees(moved[2])) / seconds, 2),
-                "heading_deg": round(float(np.degrees(np.arctan2(*ahead[::-1]))), 1) % 360
-                if moves
+                "heading_deg": round(float(np.degrees(np.arctan2(*travel[::-1]))), 1) % 360
+                if np.hypot(*travel) > TURNS_ON_SPOT * path
                 else None,
                 "along_mm_s": round(1000 * float(off[:2] @ ahead), 2),
                 "across_mm_s": round(1000 * float(ahead[0] * off[1] - ahead[1] * off[0]), 2),
@@ -283,6 +307,12 @@ def _quarters(runs: Sequence[ev.RunEvidence | None]) -> ev.Quarters:
             for name, value in row.items():
                 columns[name].append(value)
     return ev.Quarters(**columns)
+
+
+def _travel(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "2"]:
+    """Return the way ahead and to the left in the body frame, summed over steps [m]."""
+    middle = 0.5 * (pose[:-1, 2] + pose[1:, 2])
+    return np.asarray(turned(-middle, np.diff(pose[:, :2], axis=0)).sum(axis=0))
 
 
 def _poses(track: ev.Track) -> Float[np.ndarray, "edge 3"]:

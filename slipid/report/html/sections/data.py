@@ -129,7 +129,7 @@ def quality(found: Results) -> PageSection:
 
 def _coverage_table(found: Results, evidence: FitEvidence) -> TableBlock:
     """Return a table of what was driven on each floor with each load."""
-    q, runs = evidence.quarters, evidence.runs
+    q, runs, sideways = evidence.quarters, evidence.runs, evidence.wheels.sideways
     rows = []
     for floor, load in dict.fromkeys((run.floor, run.load) for run in runs):
         mine = [k for k, run in enumerate(runs) if (run.floor, run.load) == (floor, load)]
@@ -138,9 +138,6 @@ def _coverage_table(found: Results, evidence: FitEvidence) -> TableBlock:
         turn = np.array(q.turn_deg_s)[parts]
         headings = [q.heading_deg[n] for n in parts.tolist()]
         sectors = {int(h // SECTOR_DEG) for h in headings if h is not None}
-        rest = sum(
-            q.seconds[n] for n in parts.tolist() if q.speed[n] < 0.005 and abs(q.turn_deg_s[n]) < 1
-        )
         rows.append(
             (
                 floor,
@@ -150,8 +147,8 @@ def _coverage_table(found: Results, evidence: FitEvidence) -> TableBlock:
                 f"{sum(runs[k].path_m for k in mine):.1f}",
                 f"{speed.min():.2f} to {speed.max():.2f}",
                 f"{turn.min():.0f} to {turn.max():.0f}",
-                f"{len(sectors)} of {360 // SECTOR_DEG}",
-                f"{rest:.0f}",
+                *([f"{len(sectors)} of {360 // SECTOR_DEG}"] if sideways else []),
+                f"{sum(runs[k].rest_s for k in mine):.0f}",
             )
         )
     head = (
@@ -162,13 +159,12 @@ def _coverage_table(found: Results, evidence: FitEvidence) -> TableBlock:
         "metres",
         "speed [m/s]",
         "turn [deg/s]",
-        "directions",
+        *(["directions"] if sideways else []),
         "rest [s]",
     )
-    caption = (
-        f"What was driven: {len(runs)} runs. Directions are sectors of {SECTOR_DEG} degrees in the "
-        "body frame."
-    )
+    caption = f"What was driven: {len(runs)} runs."
+    if sideways:
+        caption += f" Directions are sectors of {SECTOR_DEG} degrees in the body frame."
     return TableBlock(caption, head, rows, right=head[2:])
 
 

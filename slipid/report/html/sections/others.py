@@ -13,6 +13,7 @@ from slipid.report.html.blocks import (
     TextBlock,
     colour,
     label,
+    marker,
     spanned,
 )
 from slipid.report.html.results import Results
@@ -60,7 +61,7 @@ def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> Figu
     """Return the figure of held-out errors of this robot and of the others."""
     errors = found.trust["held_out_error_over_path"]
     data, every = [], []
-    for k, model in enumerate(ERRORS):
+    for model in ERRORS:
         own = {
             f: e.get(found.selected[f] if model == "selected" else model) for f, e in errors.items()
         }
@@ -73,7 +74,7 @@ def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> Figu
                 [name for name, _ in rows],
                 label(model),
                 colour(model),
-                marker={"size": 9, "opacity": 1, "symbol": draw.SYMBOLS[k]},
+                marker=marker(model),
                 hovertemplate="%{y}: %{x:.2f} % of the path<extra>%{fullData.name}</extra>",
             )
         )
@@ -84,7 +85,7 @@ def _errors(found: Results, bands: dict[str, tuple[ReferenceBand, ...]]) -> Figu
         f"This robot is predicted within {_span(mine)} of the path, others within {_span(theirs)}"
     )
     x = draw.axis("error on held-out runs [% of the path]")
-    x |= {"type": "log"} if is_wide(every) else {"rangemode": "tozero"}
+    x |= draw.logarithmic() if is_wide(every) else {"rangemode": "tozero"}
     y = {"automargin": True, "autorange": "reversed"}
     layout = {"xaxis": x, "yaxis": y, "showlegend": True}
     alt = f"{title}. Dots show the errors of three models on every floor of every robot."

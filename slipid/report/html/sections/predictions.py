@@ -17,6 +17,7 @@ from slipid.report.html.blocks import (
     colour,
     enumerated,
     label,
+    marker,
 )
 from slipid.report.html.evidence import MapEvidence, Quarters, RunEvidence, Track
 from slipid.report.html.results import Results
@@ -25,6 +26,8 @@ from slipid.support.content import Content
 
 SHOWN_RANKS = 5
 """Number of models of a ranking that are listed; the figure shows all."""
+MOST_NAMED = 4
+"""Number of floors from which on a title does not name all of them."""
 HALF90 = 1.645
 """Half width of a 90 % interval of a normal distribution [std]."""
 
@@ -47,7 +50,7 @@ def _selection(found: Results, errors: Content) -> list[Block]:
     floors, rows = list(errors), []
     models = list(dict.fromkeys(m for each in errors.values() for m in each))
     data = []
-    for k, model in enumerate(models):
+    for model in models:
         mine = [f for f in floors if model in errors[f]]
         spread = [
             100 * HALF90 * behind[f]["behind"][model][1] if f in behind else 0.0 for f in mine
@@ -59,7 +62,7 @@ def _selection(found: Results, errors: Content) -> list[Block]:
                 (spread, spread),
                 label(model),
                 colour(model),
-                marker={"symbol": draw.SYMBOLS[k]},
+                marker=marker(model),
                 hovertemplate="%{y}: %{x:.2f} % of the path<extra>%{fullData.name}</extra>",
             )
         )
@@ -73,14 +76,16 @@ def _selection(found: Results, errors: Content) -> list[Block]:
             chosen: Cell = badge("selected") if model == best else ""
             row = (floor, label(model), f"{100 * error:.2f}", difference, chosen)
             rows.append(row)
-    title = "; ".join(_compared(f, errors[f], found.selected[f]) for f in floors[:3])
+    title = "; ".join(_compared(f, errors[f], found.selected[f]) for f in floors[:MOST_NAMED])
+    if len(floors) > MOST_NAMED:
+        title += f"; {len(floors) - MOST_NAMED} more in the table"
     layout: Content = {
         "xaxis": draw.axis("error on held-out runs [% of the path]", rangemode="tozero"),
         "yaxis": {"automargin": True, "autorange": "reversed"},
         "showlegend": True,
     }
     if is_wide([100 * e for each in errors.values() for e in each.values()]):
-        layout["xaxis"] |= {"type": "log", "rangemode": "normal"}
+        layout["xaxis"] |= draw.logarithmic() | {"rangemode": "normal"}
     alt = f"{title}. Dots show the error of every model on every floor; the table has the numbers."
     caption = (
         "Mean over held-out runs and their halves; bars are 90 % intervals of the difference from "
@@ -118,12 +123,10 @@ def _validation(content: Content) -> list[Block]:
     floors = list(summary)
     names = [m for m in MODELS if any(m in summary[f] for f in floors)]
     data, rows = [], []
-    for k, model in enumerate(names):
+    for model in names:
         mine = [f for f in floors if model in summary[f]]
         error = [100 * summary[f][model]["endpoint_error_over_path_mean"] for f in mine]
-        symbol = draw.SYMBOLS[k % len(draw.SYMBOLS)]
-        marker = {"symbol": symbol, "size": 9, "opacity": 1}
-        data.append(draw.dots(error, mine, label(model), colour(model), marker=marker))
+        data.append(draw.dots(error, mine, label(model), colour(model), marker=marker(model)))
         for f in mine:
             one = summary[f][model]
             inside = one["coverage90"]
@@ -150,7 +153,7 @@ def _validation(content: Content) -> list[Block]:
         "yaxis": {"automargin": True, "autorange": "reversed"},
         "showlegend": True,
     }
-    layout["xaxis"] |= {"type": "log"} if is_wide(every) else {"rangemode": "tozero"}
+    layout["xaxis"] |= draw.logarithmic() if is_wide(every) else {"rangemode": "tozero"}
     alt = f"{title}. Dots show the error of every model by floor; the table has the numbers."
     head = ("floor", "model", "end error [% of path]", "heading [deg]", "in 90 % region", "runs")
     about = "Errors of open-loop predictions of the runs of `slipid validate`, and coverage [%]."
@@ -222,9 +225,11 @@ def paths(found: Results) -> PageSection | None:
         f"runs were fitted: the errors of held-out runs are above.{_inside(evidence.runs)}"
     )
     if evidence.over_floors:
+        refused = found.fit is not None and "refused" in found.fit["settings"]
         about += (
-            f" {len(evidence.over_floors)} runs over several floors are drawn on their map, from "
-            "which the models take the floor under each wheel; they have no region."
+            f" Runs over several floors ({len(evidence.over_floors)}) are drawn on their map, from "
+            "which the models take the floor under each wheel; they have no region"
+            f"{', and were not used in the fit, which they contradict' if refused else ''}."
         )
     alt = (
         "Measured path of a run, and its predictions by the config's lengths, by calibrated "
@@ -262,15 +267,15 @@ def _inside(runs: Sequence[RunEvidence]) -> str:
 def _played(run: RunEvidence) -> Content:
     """Return the content of a run from which the page plays it."""
     region = None if run.region is None else run.region.model_dump()
-    # the mean command of a run in circles is far smaller than its speed
-    is_straight = run.speed is not None and run.speed * run.seconds > 0.5 * run.path_m
+    # a command that changes its direction has a median far below the speed of the run
+    steady = run.speed is not None and run.speed * run.seconds > 0.5 * run.path_m
     return {
         "name": run.name,
         "floor": run.floor,
         "load": run.load,
         "map": run.map,
-        "speed": run.speed if is_straight else None,
-        "heading": run.heading_deg,
+        "speed": run.speed if steady else None,
+        "heading": run.heading_deg if steady else None,
         "path": run.path_m,
         "time": run.time_s,
         "measured": _flat(run.measured),

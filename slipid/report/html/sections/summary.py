@@ -23,13 +23,15 @@ from slipid.report.html.figures import axis, dots
 from slipid.report.html.results import Results
 from slipid.report.numbers import estimate
 from slipid.support.content import Content
+from slipid.support.errors import first_names
 
 MOST_NOTES = 5
 """Largest number of notes beside the verdict; further ones are in the section on data quality."""
 UNDETERMINED = 1.5
 """Width of an interval over that of the prior from which on the interval is not shown [1]."""
 USE = {
-    WORDS[0]: "Use it on the floors below: no simpler model predicts held-out runs better.",
+    WORDS[0]: "Use the selected models on these floors: no simpler model predicts held-out runs "
+    "better.",
     WORDS[1]: "Use it with care, and read the reasons first.",
     WORDS[2]: "Do not deploy it as it is. The calibrated lengths below may still be useful.",
 }
@@ -259,7 +261,7 @@ def _apart(found: Results) -> TextBlock | None:
             out.append(
                 f"{name}: {mine} ({spanned((low, high))}) by the calibrated kinematics, "
                 f"{its} ({spanned((a, b))}) by the force balance. Each belongs to its own model: "
-                "type in that of the calibration; robot.json has that of the selected model"
+                "odometry takes that of the calibration; robot.json has that of the selected model"
             )
     return TextBlock(out, listed=True, kind="warning") if out else None
 
@@ -274,7 +276,8 @@ def _origin(found: Results) -> str:
 
 def _counts(found: Results) -> str:
     """Return how many parameters have each verdict."""
-    words = [e["verdict"] for e in found.parameters.values() if e["verdict"] != "fixed"]
+    shown = [e for path, e in found.parameters.items() if "session_yaw" not in path]
+    words = [e["verdict"] for e in shown if e["verdict"] != "fixed"]
     names = ("identified", "weak", "disputed", "not_identified", "at_bound")
     return enumerated([f"{words.count(w)} {w.replace('_', ' ')}" for w in names if w in words])
 
@@ -408,16 +411,17 @@ def _remedies(found: Results) -> list[Block]:
         where = f"on {floor}: {remedy.replace('drive there', 'drive')}" if floor else remedy
         if paths:
             out.append(f"{where}: for {enumerated(paths)}")
-    weak = [p for p, e in found.parameters.items() if e["verdict"] == "weak"]
+    verdicts = {p: e["verdict"] for p, e in found.parameters.items() if "session_yaw" not in p}
+    weak = [path for path, word in verdicts.items() if word == "weak"]
     if weak and found.design is None:
         command = f"slipid design {found.folder.name}"
         out.append(
             f"run `{command}`, which proposes the runs that narrow them most: for "
-            f"{enumerated(weak)}, which are weak"
+            f"{first_names(weak)}, which are weak"
         )
     elif weak:
         out.append(
-            f"drive the runs of 'What to drive next': for {enumerated(weak)}, which are weak"
+            f"drive the runs of 'What to drive next': for {first_names(weak)}, which are weak"
         )
     if not out:
         return []
