@@ -478,7 +478,7 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     for one in shown.over_floors:  # they were driven on this floor
         assert one.floor == "soft"
         assert end_error(one, "contact") < 0.05 * one.path_m < 2 * end_error(one, "nominal")
-    assert "4 runs over several floors are drawn" in (out / "report.html").read_text()
+    assert "Runs over several floors (4) are drawn" in (out / "report.html").read_text()
     run = json.loads((out / "run.json").read_text())
     assert run["data"]["hash"] == fit.data_hash
     assert len(run["data"]["logs"]) == 16
@@ -545,6 +545,7 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     said = invoke("identify", config, "--data", tmp_path / "logs", "--out", out)
     assert said.exit_code == 0, said.stderr
     assert "were not used, since they contradict the runs on one floor" in said.stderr
+    assert "not used in the fit, which they contradict" in (out / "report.html").read_text()
     fit = load(out)
     assert fit.mixed is None
     assert fit.refused["reason"] in fit.messages
