@@ -34,7 +34,7 @@ class Case:
 
 
 CASES = {
-    "by joystick": Case(("joystick",), ("square", "circular"), 50.5),
+    "runs by joystick": Case(("joystick",), ("square", "circular"), 50.5),
     "squares": Case(("square",), ("joystick", "circular"), 92.3),
 }
 
@@ -67,9 +67,9 @@ def test_ends_of_closed_paths(name: str, real_data: Path, tmp_path: Path) -> Non
         mean, share = off.mean(), 100 * np.mean(1e-3 * off / path)
         print(f"{model:24}{mean:8.1f} mm{share:8.2f} % of the path")
         if model in SHOWN:
-            row = [f"runs {name}", SHOWN[model], round(mean, 1), round(share, 2)]
+            row = [name, SHOWN[model], round(mean, 1), round(share, 2)]
             record("omni3", [row], keys=2)
-    squares = [f"runs {name}", "least squares on the same runs", case.least_squares_mm, None]
+    squares = [name, "least squares on the same runs", case.least_squares_mm, None]
     record("omni3", [squares], keys=2)
     mine = errors_mm(found, "identified").mean()
     assert QUICK or mine < case.least_squares_mm
