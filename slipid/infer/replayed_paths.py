@@ -51,7 +51,7 @@ def replayed(models: MotionModels, data: Runs) -> Iterator[ReplayedPaths]:
     contact, seen = models.contact, models.seen
     for w in replay.replay_windows(data, _sensor(models)):
         paths: dict[str, Paths] = {}
-        scale, measured = None, _measured(seen, w)
+        scale = None
         for name, model in models.kinematic.items():
             noise = models.calibration if name == "calibrated" else None
             paths[name], own = kinematic_bodies(model, seen, w, noise)
@@ -59,11 +59,9 @@ def replayed(models: MotionModels, data: Runs) -> Iterator[ReplayedPaths]:
         if contact is not None:
             paths["contact"], of_contact = contact.body_paths(w)
             chosen = np.array([models.selected[floor] == "contact" for floor in w.surface])
-            measured = np.where(chosen[:, None, None], _measured(contact.robot, w), measured)
             others = of_contact if scale is None else scale
             scale = np.where(chosen[:, None, None, None], of_contact, others)
-        begun = {n: moved_to_start(path, measured[:, 0]) for n, path in paths.items()}
-        yield ReplayedPaths(w, begun, measured, w.surface, scale)
+        yield _begun(models, w, paths, w.surface, scale)
 
 
 def replayed_over_floors(
@@ -94,10 +92,24 @@ def replayed_over_floors(
             step = np.asarray(replay.contact_increments(robot, lk.batch(w, robot, numbers[under])))
             paths["contact"] = _bodies(robot, w, step)
         most = tuple(floor.surfaces[np.bincount(row).argmax()] for row in main)
-        by_sensor = (_measured(models.sensor(name), w)[n] for n, name in enumerate(most))
-        measured = np.stack(list(by_sensor))
-        begun = {n: moved_to_start(path, measured[:, 0]) for n, path in paths.items()}
-        yield ReplayedPaths(w, begun, measured, most, None)
+        yield _begun(models, w, paths, most, None)
+
+
+def _begun(
+    models: MotionModels,
+    w: Windows,
+    paths: Mapping[str, Paths],
+    floor: tuple[str, ...],
+    scale: Float[np.ndarray, "run edge 2 2"] | None,
+) -> ReplayedPaths:
+    """Return the paths, moved to begin at the first pose by the sensor of the selected model."""
+    measured = _measured(models.seen, w)
+    if models.contact is not None:
+        by_contact = np.array([models.sensor(name) is models.contact.robot for name in floor])
+        own = _measured(models.contact.robot, w)
+        measured = np.where(by_contact[:, None, None], own, measured)
+    begun = {name: moved_to_start(path, measured[:, 0]) for name, path in paths.items()}
+    return ReplayedPaths(w, begun, measured, floor, scale)
 
 
 def _sensor(models: MotionModels) -> Robot:

@@ -304,13 +304,13 @@ def test_a_run_over_several_floors_is_drawn_on_its_map(small, tmp_path):
     assert place[:, 2].max() < 0
     assert "over several floors (soft, rug), not all of them identified" in found.about["notes"]
     write_map(tmp_path / "site.toml", uniform("soft", 0.5), {"soft": "#ffffff"})
-    alike = exported(out, "site/run.csv", tmp_path, *words, "--map", tmp_path / "site.toml")
+    mapped = exported(out, "site/run.csv", tmp_path, *words, "--map", tmp_path / "site.toml")
     single = exported(small[0] / "out", RUN, tmp_path)
     for name in PATHS[:3]:
-        np.testing.assert_allclose(alike.poses(name), single.poses(name), atol=1e-6)
-    gap = alike.poses("selected")[-1, :2] - single.poses("selected")[-1, :2]
-    assert np.hypot(*gap) < 0.02  # without the shared effects of neighbouring runs
-    assert alike.about["selected_model"] == single.about["selected_model"]
+        np.testing.assert_allclose(mapped.poses(name), single.poses(name), atol=1e-6)
+    error = mapped.poses("selected")[-1, :2] - single.poses("selected")[-1, :2]
+    assert np.hypot(*error) < 0.02  # without the shared effects of neighbouring runs
+    assert mapped.about["selected_model"] == single.about["selected_model"]
     # the start is that of the measured path, and the robot is lost no farther than wheels slip
     np.testing.assert_allclose(found.poses("estimator")[0], found.poses("measured")[0], atol=0.01)
 

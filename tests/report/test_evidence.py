@@ -105,10 +105,10 @@ def test_a_map_is_cut_to_what_its_runs_need():
     corners = [(1.5, -9.0), (9.0, -9.0), (9.0, 9.0), (1.5, 9.0)]
     whole = from_polygons("soft", [("rug", corners)], (-5.0, -5.0, 5.0, 5.0))
     shown = _map(whole, [run])
-    assert shown.corner_m == pytest.approx((0.6, -0.4))
+    assert shown.corner_m == pytest.approx((-0.2, -1.2))
     cells, cell = np.array(shown.cells), shown.cell_m[0]
-    assert cells.shape == (100, 100)
-    assert cell == pytest.approx(0.018)
+    assert cells.shape == (200, 200)
+    assert cell == pytest.approx(0.017)
     edge = shown.corner_m[0] + cell * np.count_nonzero(cells[0] == 0)
     assert edge == pytest.approx(1.5, abs=cell)
     far = run.model_copy(update={"measured": Track(x_mm=[50000] * 2, y_mm=[0, 0], yaw_mrad=[0, 0])})

@@ -10,6 +10,7 @@ from slipid.report.html.blocks import CopyLines, FigureBlock, TableBlock, TextBl
 from slipid.report.html.evidence import FitEvidence, Quarters, write_evidence
 from slipid.report.html.fit_page import fit_page
 from slipid.report.html.results import read_results
+from slipid.report.html.sections.predictions import _played
 
 
 def value(x, half, verdict="identified", unit="m"):
@@ -209,6 +210,21 @@ def test_runs_that_end_inside_their_regions_are_counted(folder):
     """Ends are 120 mm off, along regions with half axes of 125, 115, 105 and 95 mm."""
     write_evidence(driven((0.1, 0.2, 0.3, 0.4), 0.0), folder)
     assert "1 of 4 end inside their region" in words(page_of(folder)["paths"])
+
+
+def test_the_table_of_what_was_driven_is_that_of_two_wheels(folder):
+    write_evidence(driven((0.1, 0.2), 0.0), folder)
+    table = next(block for block in page_of(folder)["data"] if isinstance(block, TableBlock))
+    assert "directions" not in table.head  # two wheels drive ahead or back
+    assert dict(zip(table.head, table.rows[0], strict=True))["rest [s]"] == "4"
+
+
+def test_a_command_that_changes_its_direction_is_not_shown_as_the_speed():
+    straight = driven((0.2,), 0.0).runs[0]
+    circle = straight.model_copy(update={"speed": 0.01})
+    for run, shown in ((straight, 0.2), (circle, None)):
+        assert _played(run)["speed"] == shown
+    assert (_played(straight)["heading"], _played(circle)["heading"]) == (0.0, None)
 
 
 def test_a_robot_is_not_compared_with_itself(folder):

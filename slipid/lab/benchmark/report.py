@@ -291,7 +291,7 @@ def ranking_figure(rows: Content, name: str, title: str, over: str) -> FigureBlo
         above = [100 * (ends[n][2] - ends[n][0]) for n in mine]
         data.append(draw.errors(middle, mine, (below, above), label, shade))
     layout = {
-        "xaxis": draw.axis(f"mean end-point error over the {over} [%]", type="log"),
+        "xaxis": draw.axis(f"mean end-point error over the {over} [%]", **draw.logarithmic()),
         "yaxis": {"automargin": True, "categoryorder": "array", "categoryarray": order},
         "showlegend": True,
     }

@@ -66,7 +66,7 @@ def axis(title: str, **more: Any) -> Content:
 
 
 def logarithmic() -> Content:
-    """Return what makes an axis logarithmic, with whole numbers as its labels."""
+    """Return what makes an axis logarithmic, with labels at 1, 2 and 5 of every decade."""
     ticks = [round(step * 10.0**power, 3) for power in range(-3, 4) for step in (1, 2, 5)]
     return {"type": "log", "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
 

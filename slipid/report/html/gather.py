@@ -1,6 +1,6 @@
 """Gathering of the evidence of a fit, or of a calibration, from its runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +11,7 @@ from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
 from slipid.data.windows import incomplete_poses
 from slipid.fitting.variances import DEGREES
-from slipid.infer.body_path import LEVEL, measured_path
+from slipid.infer.body_path import LEVEL, BodyPath, measured_path
 from slipid.infer.measured_windows import MeasuredWindows, driving_torque, measured_windows
 from slipid.infer.motion_models import MotionModels
 from slipid.infer.replayed_paths import ReplayedPaths, replayed, replayed_over_floors
@@ -25,7 +25,7 @@ from slipid.support.progress import Tell, silent
 
 MOST_POSES, MOST_REGIONS = 65, 12
 """Largest numbers of poses, and of regions, that are kept of a run."""
-MOST_CELLS = 100
+MOST_CELLS = 200
 """Largest number of rows, and of columns, that are kept of a floor map."""
 MOST_DOTS = 6000
 """Largest number of segments whose wheels become dots; of more, evenly spaced ones are kept."""
@@ -79,7 +79,10 @@ def evidence_of_runs(
     reasons = [incomplete_poses(data, k) for k in range(len(data))]
     runs: dict[int, ev.RunEvidence] = {}
     try:
-        runs = _paths(data, models, [k for k, why in enumerate(reasons) if why is None], tell)
+        if numbers := [k for k, why in enumerate(reasons) if why is None]:
+            some = data.subset(numbers)
+            found = _paths(some, models, replayed(models, some), tell)
+            runs = dict(zip(numbers, found, strict=True))
     except DataError as error:  # a run has too few poses to be predicted
         notes.append(f"no paths from measured starts: {error}")
     whole = set(runs)
@@ -112,16 +115,16 @@ def _wheels(shape: Geometry) -> ev.WheelLayout:
 
 
 def _paths(
-    data: Runs, models: MotionModels, whole: Sequence[int], tell: Tell
-) -> dict[int, ev.RunEvidence]:
-    """Return the evidence of the runs with these indices, whose poses are whole."""
+    data: Runs, models: MotionModels, replays: Iterable[ReplayedPaths], tell: Tell = silent
+) -> list[ev.RunEvidence]:
+    """Return the evidence of runs whose poses are whole, from their replays."""
     out: dict[int, ev.RunEvidence] = {}
-    if whole:
-        for done in replayed(models, data.subset(whole)):
-            for n, k in enumerate(done.w.run.tolist()):
-                out.setdefault(whole[k], _run(data, models, done, n, whole[k]))
-            tell(len(out), len(whole))
-    return out
+    for done in replays:
+        for n, k in enumerate(done.w.run.tolist()):
+            if k not in out:  # runs are repeated to fill a group
+                out[k] = _run(data, models, done, n, k)
+        tell(len(out), len(data))
+    return [out[k] for k in sorted(out)]
 
 
 def _spread(last: int, most: int) -> np.ndarray:
@@ -134,26 +137,19 @@ def _over_floors(
 ) -> tuple[list[ev.RunEvidence], list[ev.MapEvidence], list[str]]:
     """Return the evidence of runs over several floors, their maps, and sentences on what it lacks.
 
-    A run whose poses lack a coordinate, or that has too few, has no evidence.
+    The fit has used their poses, which are whole.
     """
     out: list[ev.RunEvidence] = []
     maps: list[ev.MapEvidence] = []
     notes: list[str] = []
     for data, floor in mixed:
-        runs: list[ev.RunEvidence] = []
-        for k in range(len(data)):
-            one = data.subset([k])
-            try:
-                if reason := incomplete_poses(one, 0):
-                    raise DataError(reason)
-                done = next(replayed_over_floors(models, one, floor))
-            except DataError as error:
-                notes.append(f"no path over several floors: {error}")
-                continue
-            runs.append(_run(one, models, done, 0, 0).model_copy(update={"map": len(maps)}))
-        if runs:
-            maps.append(_map(floor, runs))
-            out += runs
+        try:
+            runs = _paths(data, models, replayed_over_floors(models, data, floor))
+        except DataError as error:  # a run has too few poses to be predicted
+            notes.append(f"no paths over several floors: {error}")
+            continue
+        out += [run.model_copy(update={"map": len(maps)}) for run in runs]
+        maps.append(_map(floor, runs))
     return out, maps, notes
 
 
@@ -164,7 +160,7 @@ def _map(floor: FloorMap, runs: Sequence[ev.RunEvidence]) -> ev.MapEvidence:
         for axis in ("x_mm", "y_mm")
     )
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
-    margin = 0.2 + 0.2 * float((high - low).max())
+    margin = 0.2 + float((high - low).max())  # the page shows what is beside the paths too
     low, high = low - margin, high + margin
     low, high = np.maximum(low, floor.extent[:2]), np.minimum(high, floor.extent[2:])
     if (high <= low).any():  # the runs are beside their map
@@ -191,8 +187,8 @@ def _run(data: Runs, models: MotionModels, done: ReplayedPaths, n: int, k: int) 
     kept = _spread(len(time) - 1, MOST_POSES - 1)
     paths = {name: path[n, kept] for name, path in done.paths.items()}
     region = None if done.scale is None else _region(done.scale[n], kept)
-    measured, floor = done.measured[n, kept], done.floor[n]
-    return _evidence(data, models, k, time[kept], measured, paths, region, floor)
+    measured = BodyPath(time[kept], done.measured[n, kept])
+    return _evidence(data, models, k, measured, paths, region, done.floor[n])
 
 
 def _aligned(data: Runs, models: MotionModels, k: int) -> ev.RunEvidence | None:
@@ -212,16 +208,15 @@ def _aligned(data: Runs, models: MotionModels, k: int) -> ev.RunEvidence | None:
         x, y, yaw = (np.interp(time, found.time, column) for column in found.pose.T)
         place = np.stack([x, y], axis=-1) + turned(yaw, offset)  # of the pose sensor
         paths[name] = np.column_stack([place, yaw])
-    poses, floor = measured.pose[kept], data.surface[k]
-    return _evidence(data, models, k, time - time[0], poses, paths, None, floor)
+    shown = BodyPath(time - time[0], measured.pose[kept])
+    return _evidence(data, models, k, shown, paths, None, data.surface[k])
 
 
 def _evidence(
     data: Runs,
     models: MotionModels,
     k: int,
-    time: Float[np.ndarray, " edge"],
-    measured: Float[np.ndarray, "edge 3"],
+    measured: BodyPath,
     paths: Mapping[str, Float[np.ndarray, "edge 3"]],
     region: ev.PointRegions | None,
     floor: str,
@@ -234,11 +229,11 @@ def _evidence(
         load=data.logs[k].load,
         heading_deg=round(float(heading), 1) if np.isfinite(heading) else None,
         speed=round(float(speed), 3) if np.isfinite(speed) else None,
-        seconds=round(float(time[-1]), 2),
+        seconds=round(float(measured.time[-1]), 2),
         rest_s=round(_rest(data, k, float(models.shape.wheel_radius)), 2),
-        path_m=round(float(np.linalg.norm(np.diff(measured[:, :2], axis=0), axis=1).sum()), 4),
-        time_s=np.round(time, 2).tolist(),
-        measured=_track(measured),
+        path_m=round(float(np.linalg.norm(np.diff(measured.pose[:, :2], axis=0), axis=1).sum()), 4),
+        time_s=np.round(measured.time, 2).tolist(),
+        measured=_track(measured.pose),
         models={name: _track(path) for name, path in paths.items()},
         region=region,
         selected=models.selected[floor],

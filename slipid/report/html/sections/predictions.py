@@ -27,7 +27,7 @@ from slipid.support.content import Content
 SHOWN_RANKS = 5
 """Number of models of a ranking that are listed; the figure shows all."""
 MOST_NAMED = 4
-"""Number of floors from which on a title does not name all of them."""
+"""Largest number of floors that a title names."""
 HALF90 = 1.645
 """Half width of a 90 % interval of a normal distribution [std]."""
 
