@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -44,6 +45,21 @@ def test_on_a_map_of_one_floor_they_are_those_of_runs_on_it(fitted):
     for name, path in alone.paths.items():
         np.testing.assert_allclose(mapped.paths[name], path, rtol=0, atol=within[name])
         np.testing.assert_allclose(mapped.paths[name][:, 0], mapped.measured[:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("on_map", [False, True])
+def test_measured_poses_are_those_by_the_sensor_of_the_selected_model(fitted, on_map):
+    models, data = fitted
+    place = models.contact.robot.camera.marker_place
+    seen = eqx.tree_at(lambda r: r.camera.marker_place, models.contact.robot, place + 0.03)
+    measured = []
+    for name in ("calibrated", "contact"):
+        chosen = replace(models, seen=seen, selected={"soft": name})
+        maps = (uniform("soft"),) if on_map else ()
+        (done,) = (replayed_over_floors if on_map else replayed)(chosen, data, *maps)
+        measured.append(done.measured[..., :2])
+    apart = np.linalg.norm(measured[0] - measured[1], axis=-1)
+    np.testing.assert_allclose(apart, 0.03 * np.sqrt(2), rtol=1e-6)
 
 
 def test_calibrated_wheels_have_the_radii_of_the_floor_below(fitted):
