@@ -10,7 +10,7 @@ torque are those of real motors (`_size`). The fractions of the benches in the l
 - brush drop: none 13 %, tanh 22 %, 1 - exp(-s) 29 %, s / (1 + s) 20 %, log(1 + s) 16 %, with
   s = |I| / I_0; 1 to 15 % of the supply and at most 2 V; I_0 is 2 to 30 % of the stall current.
 - 16 % contact film (R falls by 15 to 50 % over 15 to 50 % of the stall current); 23 % copper and
-  magnets that heat (copper by 10 to 45 K); 26 % cogging; 20 % Stribeck friction; 26 % ripple of
+  magnets that heat (copper by 10 to 50 K); 26 % cogging; 20 % Stribeck friction; 26 % ripple of
   torque and induced voltage.
 - 40 % PWM of 10 to 25 kHz, half of it with currents sampled anywhere in the period, half with
   the mean over a period; 30 % ramps between rows, the others hold each row's voltage.
@@ -371,8 +371,10 @@ def _meters(rng: Generator, motor: Motor, row: float) -> Meters:
 
 
 def _heated(rng: Generator, experiment: Experiment) -> Experiment:
-    """Return an experiment that heats the winding by about the drawn rise, less or more by the
-    heat that comes late in the run and by the resistance that grows."""
+    """Return the experiment with a thermal resistance, from the heat of the cold motor.
+
+    The winding ends near the drawn rise, apart from when its heat comes and how R grows.
+    """
     motor, states = experiment.motor, experiment.run()
     heat = np.mean(motor.resistance_at(states.current) * states.current**2)
     duration = len(experiment.command) * experiment.supply.row
