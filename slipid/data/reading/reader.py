@@ -144,7 +144,7 @@ def _table_runs(known: Identity, layout: Layout) -> list[RawRun]:
     """Return the runs in a file of rows, with the channels of its additional files."""
     table = read_table(known.path, layout)
     if layout.drop_repeated_time:
-        table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
+        table = table.rows(np.append(np.diff(times_of(table, layout)) != 0, True))
     beside = {
         pattern: _beside(known.path, pattern, other) for pattern, other in layout.beside.items()
     }
@@ -230,7 +230,7 @@ def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
 def _run_starts(table: Table, layout: Layout) -> list[int]:
     """Return the first row of every run."""
     if layout.new_run == "time_restarts":
-        time = _time(table, layout)
+        time = times_of(table, layout)
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
         # In files with this layout the robot only drives away from the start of each run, so the
@@ -245,7 +245,7 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
 
     Quaternions become headings. Remarks about empty cells are appended to the notes.
     """
-    time = _time(table, layout)
+    time = times_of(table, layout)
     check_time(table, layout, time)
     out: dict[str, Signal] = {}
     for name, channel in layout.channels.items():
@@ -274,7 +274,7 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
     return out
 
 
-def _time(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
+def times_of(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
     """Return the times of the rows [s]."""
     if "time" not in layout.channels:
         return np.arange(len(table.values)) * float(layout.row_period or 1.0)
