@@ -1,6 +1,6 @@
 """Layout of a log of motors on a bench, from columns named by the user or found by their names."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -133,7 +133,9 @@ def motor_layout(
     taken = {column for one in channels.values() for column in one.columns}
     units = dict(zip(format.names, format.units, strict=True))
     sought = [name for name in names if name not in options.ignored | texts]
-    free = {n: m for n, m in _meanings(sought, units, zeros).items() if n not in taken}
+    replaced = {c for c, instead in _INSTEAD.items() if instead & given.keys()}
+    replaced |= {"voltage"} if "bus_voltage" in given else set()
+    free = {n: m for n, m in _meanings(sought, units, zeros, replaced).items() if n not in taken}
     known = {*given, *channels}
     # With a given bus voltage, a duty cycle is meant if there is one.
     order = ("duty", *_CHANNELS) if "bus_voltage" in given else _CHANNELS
@@ -235,15 +237,18 @@ def _names(format: TableFormat) -> list[str]:
 
 
 def _meanings(
-    names: list[str], units: Mapping[str, str], zeros: frozenset[str] = frozenset()
+    names: list[str],
+    units: Mapping[str, str],
+    zeros: frozenset[str] = frozenset(),
+    replaced: Set[str] = frozenset(),
 ) -> dict[str, ColumnMeaning]:
     """Return the meanings of columns: those of a known tool, or else those of their words.
 
-    A tool is not known by columns of zeros. A column of time is searched for by words if the tool
-    has none of its own.
+    A tool is not known by columns of zeros, or by channels that the user replaced. A column of time
+    is searched for by words if the tool has none of its own.
     """
     words = {name: meaning_of(name, units[name], of_motor=True) for name in names}
-    tool = tool_meanings([name for name in names if name not in zeros])
+    tool = tool_meanings([name for name in names if name not in zeros], replaced)
     if not tool:
         return words
     if all(one.channel != "time" for one in tool.values()):

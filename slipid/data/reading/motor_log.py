@@ -29,7 +29,7 @@ from slipid.data.reading.motor_layout import (
 from slipid.data.reading.reader import signals_of, times_of
 from slipid.data.reading.signal import Identity, RawRun, Signal, SignalSource
 from slipid.data.reading.table import Table
-from slipid.support.errors import DataError, bad_data
+from slipid.support.errors import DataError
 
 SHORTEST_S = 20e-6
 """Time between rows below which rows, as of an oscilloscope, are averaged in groups [s]."""
@@ -114,7 +114,7 @@ def _read(file: MotorFile, layout: Layout) -> _Rows:
     pulses = layout.channels.get(PULSES)
     rest = {name: one for name, one in layout.channels.items() if name != PULSES}
     layout = replace(layout, channels=rest)
-    if "time" in rest:
+    if "time" in rest and np.isfinite(times_of(table, layout)).all():
         table = _thinned(table, times_of(table, layout))
         table = table.rows(np.append(np.diff(times_of(table, layout)) != 0, True))
     return _Rows(table, layout, pulses)
@@ -151,33 +151,40 @@ def _run(name: str, main: _Rows, others: list[_Rows], options: MotorOptions) -> 
     for rows in every:
         if {*rows.layout.channels} > {"time"}:
             signals |= signals_of(rows.table, rows.layout, notes)
-    pulses = next((rows for rows in every if rows.pulses is not None), None)
-    if others or pulses is not None:
-        signals = _on_slowest(signals)
+    pulses = next((_pulses(rows) for rows in every if rows.pulses is not None), None)
     if pulses is not None:
-        signals["motor_speed"] = _pulse_speed(pulses, signals, options)
+        volts = signals.get("voltage", signals.get("duty"))
+        if volts is None:
+            found = "pulses have no direction, and there is no column for the voltage"
+            raise pulses.source.error(found, "--voltage, or --duty and --bus")
+        signals = _on_slowest(signals, pulses)
+        volts = signals.get("voltage", signals.get("duty", volts))
+        signals["motor_speed"] = _pulse_speed(pulses, volts, options)
+    elif others:
+        signals = _on_slowest(signals, None)
     path = main.table.path
     known = f"{path.name}: {name}" if name else path.name
     identity = Identity(known, path, main.table.sha256, None, "bench")
     return RawRun(identity, signals, tuple(dict.fromkeys(notes)))
 
 
-def _on_slowest(signals: Mapping[str, Signal]) -> dict[str, Signal]:
+def _on_slowest(signals: Mapping[str, Signal], pulses: Signal | None) -> dict[str, Signal]:
     """Return signals at the rows of the slowest one, within the time that all of them cover.
 
-    A faster signal is replaced by its mean over the interval around each row.
+    Pulses, if there are some, must cover the time as well. A faster signal is replaced by its mean
+    over the interval around each row.
 
     Raises:
         DataError: the signals have no time in common.
     """
-    first = max(signals.values(), key=lambda s: s.time[0])
-    last = min(signals.values(), key=lambda s: s.time[-1])
-    slowest = max(signals.values(), key=lambda s: float(np.median(np.diff(s.time))))
-    clock = slowest.time[(slowest.time >= first.time[0]) & (slowest.time <= last.time[-1])]
+    every = [*signals.values(), *([pulses] if pulses is not None else [])]
+    first, last = max(s.time[0] for s in every), min(s.time[-1] for s in every)
+    slowest = max((s.time for s in signals.values()), key=_period)
+    clock = slowest[(slowest >= first) & (slowest <= last)]
     if len(clock) < MIN_ROWS:
-        spans = (f"{s.source.path} {s.time[0]:.6g} to {s.time[-1]:.6g} s" for s in (first, last))
+        spans = {f"{s.source.path} {s.time[0]:.6g} to {s.time[-1]:.6g} s" for s in signals.values()}
         raise DataError(
-            f"times that do not overlap: {', '.join(dict.fromkeys(spans))}; expected files that "
+            f"times that do not overlap: {', '.join(sorted(spans))}; expected files that "
             "were logged at the same time, with times on the same clock"
         )
     edges = _edges(clock)
@@ -187,12 +194,17 @@ def _on_slowest(signals: Mapping[str, Signal]) -> dict[str, Signal]:
         for column in signal.values.T:
             there = ~np.isnan(column)
             time, values = signal.time[there], column[there]
-            fast = 2 * float(np.median(np.diff(time), axis=0)) <= float(np.median(np.diff(clock)))
+            fast = 2 * _period(time) <= _period(clock)
             columns.append(_means(time, values, edges) if fast else np.interp(clock, time, values))
         where = np.searchsorted(signal.time, clock, side="right").clip(1) - 1
         source = replace(signal.source, lines=signal.source.lines[where])
         out[name] = Signal(clock, np.stack(columns, axis=1), source)
     return out
+
+
+def _period(time: Float[np.ndarray, " sample"]) -> float:
+    """Return the median time between samples [s], infinite for a single one."""
+    return float(np.median(np.diff(time))) if len(time) > 1 else np.inf
 
 
 def _edges(clock: Float[np.ndarray, " row"]) -> Float[np.ndarray, " edge"]:
@@ -212,30 +224,27 @@ def _means(
     return np.diff(np.interp(edges, every, area)) / np.diff(edges)
 
 
-def _pulse_speed(rows: _Rows, signals: Mapping[str, Signal], options: MotorOptions) -> Signal:
+def _pulse_speed(pulses: Signal, volts: Signal, options: MotorOptions) -> Signal:
     """Return the speed from the times between pulses, with the sign of the voltage.
 
     While the voltage is close to zero, the speed keeps its sign.
 
-    Raises:
-        DataError: there are too few pulses, or no voltage.
+    Args:
+        pulses: number of pulses until the time of each pulse.
+        volts: voltage or duty cycle, at whose times the speed is returned.
+        options: options with the number of pulses per revolution and the gear ratio.
     """
-    volts = signals.get("voltage", signals.get("duty"))
-    if volts is None:
-        found = "pulses have no direction, and there is no column for the voltage"
-        raise bad_data(rows.table.path, found, "--voltage, or --duty and --bus")
-    times, counts = _pulses(rows)
-    clock, volt = volts.time, volts.values[:, 0]
+    volt, edges = volts.values[:, 0], _edges(volts.time)
     per_pulse = 2 * np.pi * options.gear_ratio / float(options.pulses_per_revolution or 1.0)
-    turned = np.diff(np.interp(_edges(clock), times, per_pulse * counts))
-    speed = turned / np.diff(_edges(clock))
+    count = np.interp(edges, pulses.time, pulses.values[:, 0])
+    speed = per_pulse * np.diff(count) / np.diff(edges)
     known = np.abs(volt) > 0.02 * np.abs(volt).max()
     latest = np.maximum.accumulate(np.where(known, np.arange(len(volt)), 0))
-    return Signal(clock, (np.sign(volt[latest]) * speed)[:, None], volts.source)
+    return Signal(volts.time, (np.sign(volt[latest]) * speed)[:, None], volts.source)
 
 
-def _pulses(rows: _Rows) -> tuple[Float[np.ndarray, " pulse"], Float[np.ndarray, " pulse"]]:
-    """Return the time of each pulse [s], and the number of pulses until then.
+def _pulses(rows: _Rows) -> Signal:
+    """Return the number of pulses until the time of each pulse.
 
     The column has the times of the pulses, or a count of pulses, or a level that changes between
     low and high. A time counts if the file has no other, a count if the numbers never fall.
@@ -258,4 +267,5 @@ def _pulses(rows: _Rows) -> tuple[Float[np.ndarray, " pulse"], Float[np.ndarray,
         times, counts = time[new], values[new].astype(float)
     if len(times) < MIN_ROWS or not (np.diff(times) > 0).all():
         raise source.error("fewer than two pulses, or pulses back in time", "pulses", column=0)
-    return times, counts
+    lines = np.zeros(len(times), dtype=int)
+    return Signal(times, counts[:, None], replace(source, lines=lines))

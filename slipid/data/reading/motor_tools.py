@@ -5,7 +5,7 @@ used. A motor with field-oriented control is read along its q axis, as if it had
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 from slipid.data.reading.column_names import ColumnMeaning
@@ -83,6 +83,10 @@ TOOLS = (
 )
 
 
-def tool_meanings(names: Sequence[str]) -> dict[str, ColumnMeaning]:
-    """Return the meanings of the columns of a known tool's log; empty if no tool is known."""
-    return next((found for tool in TOOLS if (found := tool.meanings(names))), {})
+def tool_meanings(names: Sequence[str], without: Set[str]) -> dict[str, ColumnMeaning]:
+    """Return the meanings of the columns of a known tool's log; empty if no tool is known.
+
+    Tools are left out that need one of the channels `without`, which the user replaced.
+    """
+    tools = (tool for tool in TOOLS if not tool.needs & without)
+    return next((found for tool in tools if (found := tool.meanings(names))), {})

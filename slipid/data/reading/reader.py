@@ -32,6 +32,8 @@ from slipid.support.errors import DataError, first_names
 
 AnyLayout = Layout | BagLayout
 """Layout of a file of rows (CSV or Parquet) or of a bag."""
+LARGEST = 1e18
+"""Largest magnitude of a number in a log; greater ones are damaged cells."""
 Session = Literal["surface/load/speed", "folder", "file"]
 """Property that the runs of one session have in common; within a session the camera's marker was
 not moved on the robot."""
@@ -254,8 +256,9 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
         columns = tuple(str(column) for column in channel.columns)
         cells = table.stacked(channel)
         source = SignalSource(table.path, columns, table.lines)
-        for i, j in np.argwhere(np.isinf(cells))[:1].tolist():
-            raise source.error("an infinite value", "a number", sample=i, column=j)
+        for i, j in np.argwhere(np.abs(cells) > LARGEST)[:1].tolist():
+            value = "an infinite value" if np.isinf(cells[i, j]) else f"a value of {cells[i, j]:g}"
+            raise source.error(value, "a measured number", sample=i, column=j)
         missing = np.isnan(cells)
         for j in np.flatnonzero(missing.any(axis=0)).tolist():
             if missing[:, j].all():
@@ -280,6 +283,7 @@ def times_of(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
         return np.arange(len(table.values)) * float(layout.row_period or 1.0)
     channel = layout.channels["time"]
     cells = table.stacked(channel)
-    if cells.shape[1] == 2:
-        cells = cells[:, :1] + 1e-9 * cells[:, 1:]
-    return ((cells * channel.scale + channel.offset) * layout.to_si("time"))[:, 0]
+    with np.errstate(over="ignore"):  # a time that overflows is infinite, which a check refuses
+        if cells.shape[1] == 2:
+            cells = cells[:, :1] + 1e-9 * cells[:, 1:]
+        return ((cells * channel.scale + channel.offset) * layout.to_si("time"))[:, 0]
