@@ -128,7 +128,7 @@ def motor_layout(
     own = {c: one for c, one in given.items() if one.file is None}
     channels = given_channels(format, own)
     stamp = stamp_columns(format.names)
-    if stamp and "time" not in given:
+    if stamp and "time" not in channels:
         channels["time"] = Channel(tuple(format.names[at] for at in stamp), "s")
     taken = {column for one in channels.values() for column in one.columns}
     units = dict(zip(format.names, format.units, strict=True))
@@ -136,7 +136,7 @@ def motor_layout(
     replaced = {c for c, instead in _INSTEAD.items() if instead & given.keys()}
     replaced |= {"voltage"} if "bus_voltage" in given else set()
     free = {n: m for n, m in _meanings(sought, units, zeros, replaced).items() if n not in taken}
-    known = {*given, *channels}
+    known = {*given, *channels} - ({"time"} - channels.keys())  # each file has its own time
     # With a given bus voltage, a duty cycle is meant if there is one.
     order = ("duty", *_CHANNELS) if "bus_voltage" in given else _CHANNELS
     for channel in order:

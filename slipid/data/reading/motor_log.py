@@ -138,7 +138,8 @@ def _beside(file: MotorFile, given: Mapping[str, GivenColumns], options: MotorOp
     """
     channels = given_channels(file.format, given)
     pulses = given.get(PULSES)
-    if channels.keys() != {PULSES} or pulses is None or pulses.unit is None:
+    alone = channels.keys() == {PULSES} and pulses is not None and pulses.unit is not None
+    if "time" not in channels and not alone:
         channels = {"time": time_channel(file.format)} | channels
     channels = of_shaft(file.format.path, channels, options)
     return _read(file, layout_of(file.format, channels, options))

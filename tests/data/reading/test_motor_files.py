@@ -9,6 +9,7 @@ import pytest
 
 from slipid.app.bench import read_motor_log
 from slipid.data.reading.motor_layout import MotorOptions, given_columns
+from slipid.data.reading.units import converts, factor
 from slipid.infer.bench.motor import BenchRecord
 from slipid.support.errors import DataError
 from tests.helpers import motor_layouts as made
@@ -105,16 +106,21 @@ def test_a_time_of_day_goes_on_after_midnight(tmp_path):
     np.testing.assert_allclose(record.speed, s.speed, atol=1e-4)
 
 
-def test_a_given_channel_replaces_its_alternatives(tmp_path):
+@pytest.mark.parametrize(("channel", "column"), [("duty", "duty_cycle"), ("bus_voltage", "")])
+def test_a_given_channel_replaces_its_alternatives(tmp_path, channel, column):
     path = made.vesc(tmp_path / "vesc.csv", made.signals())
     options = MotorOptions(pole_pairs=7.0)
-    given = {"duty": given_columns("duty_cycle", "duty")}
+    given = {channel: given_columns(column or "input_voltage", channel)}
     task = read_motor_log(path, given, None, options)
-    assert [line.split(":")[0] for line in task.columns_used] == [
+    assert {line.split(":")[0] for line in task.columns_used} == {
         *("duty", "time", "current", "speed", "bus_voltage")
-    ]
+    }
     (record,) = task.records[""]
     np.testing.assert_allclose(record.voltage, made.signals().voltage, atol=1e-6)
+
+
+def test_an_ignored_column_is_not_searched_for(tmp_path):
+    path = made.vesc(tmp_path / "vesc.csv", made.signals())
     # a column that is ignored is not searched for: the tool's other columns are taken instead
     ignoring = MotorOptions(pole_pairs=7.0, ignored=frozenset({"q_axis_voltage"}))
     used = read_motor_log(path, {}, None, ignoring).columns_used
@@ -217,6 +223,35 @@ def test_pulses_need_their_number_and_a_voltage(tmp_path):
         read(path, options, pulses="w")
     with pytest.raises(DataError, match="--gear: 0; expected a number above 0"):
         MotorOptions(gear_ratio=0.0)
+
+
+def test_the_time_of_another_file_can_be_named(tmp_path):
+    s = made.signals()
+    main = made.without_voltage(tmp_path / "main.csv", s)
+    other = tmp_path / "other.csv"
+    np.savetxt(
+        other, np.stack([1e3 * s.time, s.voltage], 1), delimiter=",", header="a,b", comments=""
+    )
+    with pytest.raises(DataError, match=r"other.csv: no column for the time among a, b"):
+        read(main, voltage=f"{other}::b")
+    (record,) = read(main, voltage=f"{other}::b:V", time=f"{other}::a:ms")
+    np.testing.assert_allclose(record.voltage, s.voltage, atol=1e-6)
+
+
+def test_a_test_of_a_single_row_is_left_out(tmp_path):
+    path = made.sysid_csv(tmp_path / "log.csv", made.signals())
+    lines = path.read_text().splitlines()
+    path.write_text(
+        "\n".join([*lines[:2], lines[2].replace("quasistatic-forward", "x"), *lines[3:]])
+    )
+    assert [r.name.split(": ")[1] for r in read(path)] == [*made.TESTS]
+
+
+def test_a_unit_with_a_tower_of_powers_is_no_unit():
+    assert given_columns("w:10**10**10", "time").unit is None
+    assert converts("m**2/m", "m")
+    with pytest.raises(ValueError, match=r"unknown unit '10\*\*10\*\*10'"):
+        factor("10**10**10", "s")
 
 
 def test_a_gear_and_a_reversed_sign(tmp_path):
