@@ -280,6 +280,23 @@ def test_a_fit_without_a_current_is_refused_with_the_reason(tmp_path):
     assert layout.channels["motor_speed"].unit == "rot/s"
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--gear", "0"), "--gear: 0; expected a number above 0"),
+        (("--ignore", "J", "--ignore", "w"), "no column 'J' to ignore"),
+        (("--ignore", "I", "--ignore", "U"), "no column for the current or voltage"),
+        (("--pulses", "w"), "only one of --pulses and --pulses-per-revolution"),
+        (("--voltage", "none.csv::CH1:V"), "none.csv: cannot be read"),
+        (("--speed", "w:-rad/s", "--voltage", "U:-V"), "the current has the wrong sign"),
+    ],
+)
+def test_options_reach_the_reader(bench, words, message):
+    result = invoke("motor", bench / "one.csv", *words, "--quiet")
+    assert result.exit_code == 2
+    assert message in result.output
+
+
 @pytest.mark.slow
 def test_two_motors_of_a_config(identified):
     found = json.loads((identified / "identified.json").read_text())

@@ -10,10 +10,13 @@ from pathlib import Path
 
 from slipid.data.reading.table import cells_of, number_in
 from slipid.data.reading.table_format import TableFormat, first_lines
+from slipid.support.errors import bad_data
 
 TIME = "time"
 """Name that is given to the time, in seconds."""
 _UNITS = {"volt": "V", "v": "V", "ampere": "A", "amp": "A", "a": "A", "second": "s", "s": "s"}
+_LONGEST_S = 1e9
+"""Largest start and step of an oscilloscope's time [s]."""
 _LINES = 60
 """Number of first lines that may be settings."""
 _SETTINGS = ("horizontal", "vertical", "record", "sample", "analog", "model")
@@ -84,7 +87,14 @@ def _made(
     units: list[str],
     clock: tuple[float, float] | None = None,
 ) -> ScopeFormat:
-    """Return a format with `header` lines above the samples."""
+    """Return a format with `header` lines above the samples.
+
+    Raises:
+        DataError: the clock is impossible.
+    """
+    if clock and not (abs(clock[0]) < _LONGEST_S and 0 < clock[1] < _LONGEST_S):
+        found = f"samples every {clock[1]:g} s from {clock[0]:g} s"
+        raise bad_data(path, found, "a start and a step of the time", row=max(header, 1))
     units = [_UNITS.get(unit.lower(), "") for unit in _padded(units, len(names))]
     if clock:
         names, units = [*names, TIME], [*units, "s"]

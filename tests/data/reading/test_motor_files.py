@@ -10,6 +10,7 @@ import pytest
 from slipid.app.bench import read_motor_log
 from slipid.data.reading.motor_layout import MotorOptions, given_columns
 from slipid.data.reading.units import converts, factor
+from slipid.data.reading.wpilog import read_wpilog
 from slipid.infer.bench.motor import BenchRecord
 from slipid.support.errors import DataError
 from tests.helpers import motor_layouts as made
@@ -329,3 +330,31 @@ def test_tests_in_a_parquet_file(tmp_path):
     records = read(path)
     assert [r.name for r in records] == ["log.parquet: up", "log.parquet: up #2"]
     assert [len(r.time) for r in records] == [200, 100]
+
+
+def test_records_of_a_data_log_are_those_of_its_specification():
+    """The bytes are the examples of its sections Records and Start."""
+    number = made.record(1, 1.0, (3).to_bytes(8, "little"))
+    assert number == bytes.fromhex("20 01 08 40 42 0f 03 00 00 00 00 00 00 00")
+    start = bytes.fromhex("00 01 00 00 00 04 00 00 00 74 65 73 74 05 00 00 00 69 6e 74 36 34")
+    assert made.started(1, "test", "int64")[4:] == start + bytes(4)
+
+
+def test_a_data_log_of_the_specification_is_read(tmp_path):
+    path = tmp_path / "log.wpilog"
+    number = made.record(1, 1.0, (3).to_bytes(8, "little"))
+    path.write_bytes(b"WPILOG\x00\x01" + bytes(4) + made.started(1, "test", "int64") + number)
+    (entry,) = read_wpilog(path).values()
+    assert (entry.name, entry.kind, entry.times, entry.values) == ("test", "int64", [1.0], [3.0])
+    path.write_bytes(b"WPILOG\x00\x02" + bytes(40))
+    with pytest.raises(
+        DataError, match=r"log.wpilog: version 2.0 of the format; expected version 1"
+    ):
+        read_wpilog(path)
+
+
+def test_an_impossible_clock_of_an_oscilloscope_is_refused(tmp_path):
+    path = made.rigol(tmp_path / "scope.csv", made.signals())
+    path.write_text(path.read_text().replace("0.02,", "1e308,", 1).replace(",0.02", ",1e308", 1))
+    with pytest.raises(DataError, match=r"scope.csv row 2: samples every 1e\+308 s"):
+        read(path, voltage="CH1")
