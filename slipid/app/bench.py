@@ -16,9 +16,9 @@ from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS
 from slipid.data.reading.layout import SensorLayout
-from slipid.data.reading.motor_layout import GivenColumns, motor_layout
+from slipid.data.reading.motor_layout import GivenColumns, MotorOptions
+from slipid.data.reading.motor_log import read_motor_logs
 from slipid.data.reading.reader import read_logs
-from slipid.data.reading.table_format import format_of
 from slipid.data.runs import counted_once
 from slipid.infer.bench.fit import check_records, fit_motor
 from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
@@ -106,38 +106,52 @@ def read_motor_log(
     path: Path,
     given: Mapping[str, GivenColumns],
     delimiter: str | None,
-    signed: bool,
-    pole_pairs: float | None = None,
+    options: MotorOptions,
 ) -> BenchTask:
-    """Return the task of motors in a single log file.
+    """Return the task of motors in a single log, whose channels may be in several files.
 
     Args:
         path: the log file.
         given: columns that the user named, keyed by channel; other channels are found by their
             column names.
         delimiter: character between cells, or None to guess it.
-        signed: True if currents have a sign.
-        pole_pairs: pole pairs of the motor if the speed is electrical, else None.
+        options: properties of the log that no file tells.
 
     Raises:
-        DataError: the file cannot be read, or lacks a channel.
+        DataError: a file cannot be read, or lacks a channel.
     """
-    layout = motor_layout(format_of(path, delimiter), given, signed, pole_pairs)
-    logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
+    found = read_motor_logs(path, given, delimiter, options)
+    logs = counted_once(found.logs)
     refuse_misordered(logs)
-    records = _by_motor([records_of(log, layout) for log in logs], (), path)
-    columns_used = tuple(
-        f"{channel.removeprefix('motor_')}: {', '.join(map(str, c.columns))} [{c.unit}]"
-        for channel, c in layout.channels.items()
-    )
+    records = _by_motor([records_of(log, found.layout) for log in logs], (), path)
+    for some in records.values():
+        _check_directions(some, found.columns_used)
     unit_is_known = "current" in given and given["current"].unit is not None
-    return BenchTask(records, dict.fromkeys(records, ()), (), columns_used, unit_is_known)
+    return BenchTask(records, dict.fromkeys(records, ()), (), found.columns_used, unit_is_known)
+
+
+def _check_directions(records: Sequence[BenchRecord], used: Sequence[str]) -> None:
+    """Raise `DataError` if voltage and speed have opposite signs while no current was logged.
+
+    With a current, the checks before the fit tell which of the three columns is reversed. `used`
+    are the lines about the columns that were used.
+    """
+    volts = [r.voltage for r in records if r.voltage is not None and r.current is None]
+    if len(volts) < len(records):
+        return
+    voltage, speed = np.concatenate(volts), np.concatenate([r.speed for r in records])
+    if voltage @ speed < -0.5 * np.linalg.norm(voltage) * np.linalg.norm(speed):
+        columns = "; ".join(line for line in used if not line.startswith("time"))
+        raise DataError(
+            f"{records[0].name}: the voltage opposes the speed ({columns}); expected one "
+            "of the two reversed, as by --speed NAME:-rad/s"
+        )
 
 
 def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     """Return a record for each motor in a log, with its speed at the motor shaft."""
-    if log.current is None:
-        raise DataError(f"{log.name}: no current; expected a column for each motor")
+    if log.current is None and log.voltage is None:
+        raise DataError(f"{log.name}: no current or voltage; expected a column for each motor")
     if log.current_is_torque:
         raise DataError(
             f"{log.name}: a torque in place of the current; expected a column of each motor's "
@@ -149,7 +163,9 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     if speed is None:
         speed = np.gradient(log.wheel_angle, log.time, axis=0)
     speed = speed * layout.gear_ratio
-    current = log.current if log.current_is_signed else np.abs(log.current) * np.sign(speed)
+    current = log.current
+    if current is not None and not log.current_is_signed:
+        current = np.abs(current) * np.sign(speed)
     # A fit needs rows with independent errors, so only rows with new readings are used.
     return [
         BenchRecord(
@@ -157,7 +173,7 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
             sha256=log.sha256,
             time=log.time[read],
             voltage=None if log.voltage is None else log.voltage[read, k],
-            current=current[read, k],
+            current=None if current is None else current[read, k],
             speed=speed[read, k],
             signed=log.current_is_signed,
         )

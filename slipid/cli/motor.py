@@ -11,12 +11,14 @@ from slipid.cli.identify import PRIORS
 from slipid.support.progress import Reporter
 
 Column = str | None
-_column = partial(option, "NAME[:UNIT]")
+_column = partial(option, "[FILE::]NAME[:UNIT]")
 
 
 @guarded
 def motor(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Log file (CSV or Parquet).")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Log file (CSV, Parquet, WPILOG, SysId JSON).")
+    ],
     time: Annotated[Column, _column("Column with the time, in s.")] = None,
     voltage: Annotated[Column, _column("Column with the voltage across the motor, in V.")] = None,
     current: Annotated[
@@ -36,6 +38,19 @@ def motor(
         float | None,
         option("NUMBER", "Pole pairs of the motor, if the speed is electrical (erpm).", min=1),
     ] = None,
+    gear: Annotated[
+        float, option("RATIO", "Motor turns per turn of the sensor of speed, angle or pulses.")
+    ] = 1.0,
+    pulses: Annotated[
+        Column,
+        _column("Column with a tachometer's count or level; with a unit of time: pulse times."),
+    ] = None,
+    pulses_per_revolution: Annotated[
+        float | None, option("NUMBER", "Pulses per turn of the tachometer; with --pulses.")
+    ] = None,
+    ignore: Annotated[
+        list[str] | None, option("NAME", "Column that is not guessed to be a channel; repeatable.")
+    ] = None,
     unsigned: Annotated[
         bool, flag("--unsigned", "The logged current is a magnitude without sign.")
     ] = False,
@@ -49,13 +64,14 @@ def motor(
     """Identify a motor on a bench from its log: resistance, back-EMF, friction and inertia.
 
     The log needs the voltage, current and speed of the motor. Columns that are not given are found
-    by their names. For several motors, separate their columns by commas. The speed must be that of
-    the motor shaft; a speed measured behind a gear cannot be detected and gives wrong results. With
-    --out, the command writes report.html, motor.json and a picture. The exit code is 1 if the model
-    does not explain the log.
+    by their names; a given channel replaces its alternatives, and :-UNIT reverses a sign. Channels
+    may be in other files with other rates but the same clock. For several motors, separate their
+    columns by commas. Speeds are those of the motor shaft unless --gear is given; a gear cannot be
+    detected. With --out, the command writes report.html, motor.json and a picture. The exit code is
+    1 if the model does not explain the log.
     """
     from slipid.app.bench import read_motor_log
-    from slipid.data.reading.motor_layout import given_columns
+    from slipid.data.reading.motor_layout import MotorOptions, given_columns
     from slipid.report.estimates import show_bench
     from slipid.support.files import write_json
 
@@ -67,11 +83,19 @@ def motor(
         "motor_angle": angle,
         "duty": duty,
         "bus_voltage": bus,
+        "pulses": pulses,
     }
+    options = MotorOptions(
+        signed=not unsigned,
+        pole_pairs=pole_pairs,
+        gear_ratio=gear,
+        pulses_per_revolution=pulses_per_revolution,
+        ignored=frozenset(ignore or ()),
+    )
     given = {c: given_columns(text, c) for c, text in columns.items() if text is not None}
     with Reporter(quiet=quiet) as report:
         report.stage("reading the log")
-        task = read_motor_log(file, given, delimiter, not unsigned, pole_pairs)
+        task = read_motor_log(file, given, delimiter, options)
         fit = task.fit(report)
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:

@@ -173,6 +173,7 @@ def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
         ({"wheel_radius_m": "0,05"}, "--wheel-radius-m '0,05': expected a number with a decimal"),
         ({"mass_kg": "0"}, "--mass-kg '0': expected a number above 0"),
         ({"mass_kg": "nan"}, "--mass-kg 'nan': expected a number above 0"),
+        ({"mass_kg": "1e308"}, "--mass-kg '1e308': expected a number of at most 1e+09"),
         (
             {"drive": "skid", "azimuths_deg": "1,2,3"},
             "--azimuths-deg: not an option for drive skid",

@@ -13,7 +13,7 @@ from slipid.app.bench_priors import bench_priors
 from slipid.app.config import parsed
 from slipid.data.reading.column_names import meaning_of
 from slipid.data.reading.layout import SensorLayout
-from slipid.data.reading.motor_layout import given_columns, motor_layout
+from slipid.data.reading.motor_layout import MotorOptions, given_columns, motor_layout
 from slipid.data.reading.table_format import format_of
 from slipid.support.errors import DataError
 from tests.helpers import made_bench as made
@@ -169,7 +169,7 @@ def test_guesses(tmp_path):
     path.write_text(
         "time [ms];motor_current_mA;speed_set;speed (rpm);Vbat;voltage\n" + "1;2;3;4;5;6\n" * 12
     )
-    layout = motor_layout(format_of(path), {}, signed=True)
+    layout = motor_layout(format_of(path), {}, MotorOptions())
     found = {k: (c.columns[0], c.unit) for k, c in layout.channels.items()}
     assert found == {
         "time": ("time [ms]", "ms"),
@@ -196,7 +196,7 @@ def test_units_of_guesses(tmp_path, lines, expected):
     delimiter = next(d for d in ";,\t" if d in lines[-1])
     row = delimiter.join("12345"[: lines[-1].count(delimiter) + 1])
     path.write_text("\n".join([*lines, *[row] * 12]))
-    layout = motor_layout(format_of(path), {}, signed=True)
+    layout = motor_layout(format_of(path), {}, MotorOptions())
     names = ("time", "voltage", "current", "motor_speed")
     assert [layout.channels[name].unit for name in names] == expected
     assert [len(layout.channels[name].columns) for name in names] == [1, 1, 1, 1]
@@ -209,12 +209,12 @@ def test_columns_of_parquet_and_columns_without_names(tmp_path):
     path = tmp_path / "log.parquet"
     rows = [float(k) for k in range(12)]
     parquet.write_table(pyarrow.table(dict.fromkeys(("t_ms", "U", "I_mA", "rpm"), rows)), path)
-    layout = motor_layout(format_of(path), {}, signed=True)
+    layout = motor_layout(format_of(path), {}, MotorOptions())
     assert [c.unit for c in layout.channels.values()] == ["ms", "V", "mA", "rpm"]
     path = tmp_path / "log.csv"
     path.write_text("1,2,3,4\n" * 12)
     with pytest.raises(DataError, match="no names for 4 columns; expected a line of column names"):
-        motor_layout(format_of(path), {}, signed=True)
+        motor_layout(format_of(path), {}, MotorOptions())
 
 
 VESC = (
@@ -234,13 +234,12 @@ def vesc(tmp_path):
 
 
 def test_a_log_of_vesc_tool_is_known_by_its_names(vesc):
-    layout = motor_layout(format_of(vesc), {}, signed=True, pole_pairs=7.0)
+    layout = motor_layout(format_of(vesc), {}, MotorOptions(pole_pairs=7.0))
     assert {k: (*c.columns, c.unit, *c.scale) for k, c in layout.channels.items()} == {
         "time": ("ms_today", "ms", 1.0),
-        "current": ("current_motor", "A", 1.0),
+        "voltage": ("q_axis_voltage", "V", 1.0),
+        "current": ("q_axis_current", "A", 1.0),
         "motor_speed": ("erpm", "rpm", 1 / 7),
-        "duty": ("duty_cycle", "1", 1.0),
-        "bus_voltage": ("input_voltage", "V", 1.0),
     }
 
 
@@ -252,23 +251,50 @@ def test_an_electrical_speed_needs_the_pole_pairs(vesc):
         assert "expected --pole-pairs" in result.output
 
 
-@pytest.mark.parametrize("name", ["q_axis_voltage", "voltage_q", "Vd", "i_q", "d_current"])
-def test_the_axes_of_a_motor_are_no_motors(name):
-    assert meaning_of(name, of_motor=True).channel == ""
+@pytest.mark.parametrize(
+    ("name", "channel"),
+    [
+        ("q_axis_voltage", "voltage"),
+        ("voltage_q", "voltage"),
+        ("i_q", "current"),
+        ("Vd", ""),
+        ("d_current", ""),
+    ],
+)
+def test_a_motor_is_read_along_its_axis_q(name, channel):
+    meaning = meaning_of(name, of_motor=True)
+    assert meaning.channel == channel
+    assert bool(meaning.doubt) == bool(channel)
 
 
-def test_voltage_and_speed_alone_are_refused_with_the_reason(tmp_path):
+def test_a_fit_without_a_current_is_refused_with_the_reason(tmp_path):
     path = tmp_path / "sysid.csv"
     rows = [f"{0.02 * k},dynamic-forward,{0.1 * k},{k},{2 * k}" for k in range(12)]
     names = "Timestamp (s),Test,Volts (V),Position (rot),Velocity (rot/s)"
     path.write_text("\n".join([names, *rows]))
     result = invoke("motor", path, "--quiet")
     assert result.exit_code == 2
+    assert "sysid.csv: dynamic-forward: no column for the current" in result.output
     assert "voltage and speed alone tell kS, kV and kA" in result.output
-    assert "expected --current" in result.output
-    given = {"current": given_columns("Volts (V):A", "current")}
-    layout = motor_layout(format_of(path), given, signed=True)
+    layout = motor_layout(format_of(path), {}, MotorOptions())
     assert layout.channels["motor_speed"].unit == "rot/s"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--gear", "0"), "--gear: 0; expected a number above 0"),
+        (("--ignore", "J", "--ignore", "w"), "no column 'J' to ignore"),
+        (("--ignore", "I", "--ignore", "U"), "no column for the current or voltage"),
+        (("--pulses", "w"), "only one of --pulses and --pulses-per-revolution"),
+        (("--voltage", "none.csv::CH1:V"), "none.csv: cannot be read"),
+        (("--speed", "w:-rad/s", "--voltage", "U:-V"), "the current has the wrong sign"),
+    ],
+)
+def test_options_reach_the_reader(bench, words, message):
+    result = invoke("motor", bench / "one.csv", *words, "--quiet")
+    assert result.exit_code == 2
+    assert message in result.output
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.bag.runs import PAUSE_S, runs_between_pauses
 from slipid.data.reading.layout import GROUPS, TURNS, Layout
-from slipid.data.reading.motor_layout import motor_layout
+from slipid.data.reading.motor_layout import MotorOptions, motor_layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
 from slipid.support.errors import DataError
@@ -75,7 +75,7 @@ def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[F
         return
     first = files[0].format.path
     try:
-        guessed = motor_layout(files[0].format, {}, signed=True, pole_pairs=1.0)
+        guessed = motor_layout(files[0].format, {}, MotorOptions(pole_pairs=1.0))
     except DataError:
         return
     channels = ", ".join(channel.removeprefix("motor_") for channel in guessed.channels)

@@ -39,6 +39,10 @@ class RobotAnswers:
     """Names of the attributes that have a default value because there was no answer."""
 
 
+LARGEST = 1e9
+"""Largest number in an answer; far larger ones overflow in computations."""
+
+
 def positive(text: str, _: RobotAnswers) -> float:
     """Return the number above 0 in an answer.
 
@@ -68,12 +72,15 @@ def positive_if_any(text: str, answers: RobotAnswers) -> float | None:
 
 
 def number(text: str) -> float:
-    """Return the number in a string."""
+    """Return the number in a string; it has an absolute value of at most `LARGEST`."""
     try:
-        return float(text.strip().replace("_", "?"))
+        value = float(text.strip().replace("_", "?"))
     except ValueError:
         comma = " with a decimal point" if "," in text else ""
         raise ValueError(f"expected a number{comma}") from None
+    if LARGEST < abs(value) < float("inf"):
+        raise ValueError(f"expected a number of at most {LARGEST:g}")
+    return value
 
 
 def count(text: str, _: RobotAnswers) -> int:

@@ -89,16 +89,6 @@ _SHORT = ("v", "a", "s", "m")
 ending as a word, has no meaning."""
 
 
-_OF_VESC = {
-    "ms_today": ("time", "ms"),
-    "input_voltage": ("bus_voltage", "V"),
-    "current_motor": ("current", "A"),
-    "current_in": ("", ""),
-}
-"""Channels and units of columns that VESC tool, which logs a motor's controller, gives a name of
-its own."""
-
-
 @dataclass(frozen=True)
 class ColumnMeaning:
     """Meaning of the name of a column.
@@ -154,8 +144,6 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
         of_motor: True if the log is that of motors on a bench, whose columns need not name a wheel
             or motor.
     """
-    if of_motor and (exact := _OF_VESC.get(name.lower())):
-        return ColumnMeaning(exact[0], "", exact[1])
     bare, suffix = without_unit(name)
     unit = unit_in(unit) or unit or suffix
     texts = [bare] if "[" in name or "(" in name or "," in name else [bare, name]
@@ -314,6 +302,8 @@ def _doubt(parts: NameParts, channel: str) -> str:
         return "erpm is the shaft's speed times the motor's pole pairs: give scale = 1 / pole pairs"
     if channel.startswith("twist") and not parts.has("what", "command"):
         return "is it a command? Measured speeds must not be used here"
+    if _of_axis(parts):
+        return "is it along the axis q of the motor?"
     if parts.mended:
         return "misspelled? " + ", ".join(parts.mended)
     return (
@@ -347,13 +337,13 @@ def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
 
 def _of_axis(parts: NameParts) -> bool:
     """Return whether a name is that of a current or voltage along the axis d or q of a motor."""
-    electric = parts.has("what", "current", "voltage")
+    electric = parts.has("what", "current", "voltage", "v")
     return electric and any(word in ("d", "q") for _, _, word in parts.roles)
 
 
 def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
     """Return the channel and the label of a name in a log of motors on a bench, or None."""
-    if parts.has("not") or _of_axis(parts):
+    if parts.has("not"):
         return None
     single = _single(parts)
     if single and single[0] in ("time", "bus_voltage"):

@@ -11,7 +11,10 @@ _OTHERS = {
     ".h5": ("an HDF5 file", "h5py or pandas.read_hdf, and DataFrame.to_csv"),
     ".hdf5": ("an HDF5 file", "h5py or pandas.read_hdf, and DataFrame.to_csv"),
     ".rrd": ("a recording of Rerun", "the dataframe API of Rerun, and DataFrame.to_csv"),
-    ".wpilog": ("a log of WPILib", "DataLogTool or AdvantageScope, which export CSV"),
+    ".wpilog": (
+        "a log of WPILib",
+        "DataLogTool or AdvantageScope, which export CSV (`slipid motor` reads it as it is)",
+    ),
     ".xlsx": ("a workbook of Excel", "Save as CSV in the spreadsheet"),
 }
 

@@ -32,6 +32,8 @@ from slipid.support.errors import DataError, first_names
 
 AnyLayout = Layout | BagLayout
 """Layout of a file of rows (CSV or Parquet) or of a bag."""
+LARGEST = 1e18
+"""Largest magnitude of a number in a log; greater ones are damaged cells."""
 Session = Literal["surface/load/speed", "folder", "file"]
 """Property that the runs of one session have in common; within a session the camera's marker was
 not moved on the robot."""
@@ -144,7 +146,7 @@ def _table_runs(known: Identity, layout: Layout) -> list[RawRun]:
     """Return the runs in a file of rows, with the channels of its additional files."""
     table = read_table(known.path, layout)
     if layout.drop_repeated_time:
-        table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
+        table = table.rows(np.append(np.diff(times_of(table, layout)) != 0, True))
     beside = {
         pattern: _beside(known.path, pattern, other) for pattern, other in layout.beside.items()
     }
@@ -230,7 +232,7 @@ def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
 def _run_starts(table: Table, layout: Layout) -> list[int]:
     """Return the first row of every run."""
     if layout.new_run == "time_restarts":
-        time = _time(table, layout)
+        time = times_of(table, layout)
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
         # In files with this layout the robot only drives away from the start of each run, so the
@@ -245,7 +247,7 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
 
     Quaternions become headings. Remarks about empty cells are appended to the notes.
     """
-    time = _time(table, layout)
+    time = times_of(table, layout)
     check_time(table, layout, time)
     out: dict[str, Signal] = {}
     for name, channel in layout.channels.items():
@@ -254,8 +256,9 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
         columns = tuple(str(column) for column in channel.columns)
         cells = table.stacked(channel)
         source = SignalSource(table.path, columns, table.lines)
-        for i, j in np.argwhere(np.isinf(cells))[:1].tolist():
-            raise source.error("an infinite value", "a number", sample=i, column=j)
+        for i, j in np.argwhere(np.abs(cells) > LARGEST)[:1].tolist():
+            value = "an infinite value" if np.isinf(cells[i, j]) else f"a value of {cells[i, j]:g}"
+            raise source.error(value, "a measured number", sample=i, column=j)
         missing = np.isnan(cells)
         for j in np.flatnonzero(missing.any(axis=0)).tolist():
             if missing[:, j].all():
@@ -274,12 +277,13 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
     return out
 
 
-def _time(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
+def times_of(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
     """Return the times of the rows [s]."""
     if "time" not in layout.channels:
         return np.arange(len(table.values)) * float(layout.row_period or 1.0)
     channel = layout.channels["time"]
     cells = table.stacked(channel)
-    if cells.shape[1] == 2:
-        cells = cells[:, :1] + 1e-9 * cells[:, 1:]
-    return ((cells * channel.scale + channel.offset) * layout.to_si("time"))[:, 0]
+    with np.errstate(over="ignore"):  # a time that overflows is infinite, which a check refuses
+        if cells.shape[1] == 2:
+            cells = cells[:, :1] + 1e-9 * cells[:, 1:]
+        return ((cells * channel.scale + channel.offset) * layout.to_si("time"))[:, 0]

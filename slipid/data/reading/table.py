@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from slipid.data.reading.containers import refuse_other
 from slipid.data.reading.layout import Channel, Layout
@@ -38,6 +38,7 @@ class Table:
             names.
         values: numbers in the cells, NaN where a cell is empty.
         lines: line number in the file of each row of `values` (record number for Parquet), from 1.
+        tests: name of the test in which each row was logged; None if the rows have no such names.
     """
 
     path: Path
@@ -45,6 +46,7 @@ class Table:
     names: tuple[str, ...]
     values: Float[np.ndarray, "row column"]
     lines: Int[np.ndarray, " row"]
+    tests: Shaped[np.ndarray, " row"] | None = None
 
     def __getitem__(self, name: str) -> Float[np.ndarray, " row"]:
         return self.values[:, self.names.index(name)]
@@ -55,7 +57,8 @@ class Table:
 
     def rows(self, which: slice | np.ndarray) -> "Table":
         """Return the table with the selected rows."""
-        return replace(self, values=self.values[which], lines=self.lines[which])
+        tests = None if self.tests is None else self.tests[which]
+        return replace(self, values=self.values[which], lines=self.lines[which], tests=tests)
 
 
 def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Table:
@@ -104,11 +107,21 @@ def bytes_of(path: Path, limit: int = -1) -> bytes:
     """Return the bytes of a file, or the first `limit` of them.
 
     Raises:
+        DataError: the file cannot be read, is empty, or is of a kind that is not read.
+    """
+    if not path.is_dir():
+        refuse_other(path)
+    return raw_bytes(path, limit)
+
+
+def raw_bytes(path: Path, limit: int = -1) -> bytes:
+    """Return the bytes of a file of any kind, or the first `limit` of them.
+
+    Raises:
         DataError: the file cannot be read, or is empty.
     """
     if path.is_dir():
         raise bad_data(path, "a folder", "a CSV or Parquet file")
-    refuse_other(path)
     try:
         with path.open("rb") as file:
             raw = file.read(limit)

@@ -94,7 +94,7 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
     if path.suffix == ".parquet":
         header = tuple(parquet_of(path, bytes_of(path)).column_names)
         return TableFormat(path, "", 1, 0, 2, header, ("",) * len(header))
-    lines = _lines(path, _SAMPLE_BYTES)
+    lines = first_lines(path)
     delimiter = delimiter or _delimiter_of(lines)
     rows = [cells_of(line, delimiter) for line in lines[:_HEADER_LINES]]
     first = _first_numbers(rows)
@@ -121,14 +121,19 @@ def numbers_of(format: TableFormat) -> TableNumbers:
     if not format.delimiter:
         _, numbers, texts = parquet_numbers(format.path, bytes_of(format.path))
         return TableNumbers(format, numbers[:ROWS], texts)
-    lines = _lines(format.path)
+    lines = lines_of(format.path)
     body = [line for line in lines[format.first_data_row - 1 :][:ROWS] if line.strip()]
     values, wrong = cell_numbers(body, format.delimiter, range(len(format.names)))
     texts = frozenset(np.flatnonzero(wrong.sum(axis=0) > 0.02 * len(body)).tolist())
     return TableNumbers(format, values, texts)
 
 
-def _lines(path: Path, limit: int = -1) -> list[str]:
+def first_lines(path: Path) -> list[str]:
+    """Return the complete lines in the first bytes of a text file."""
+    return lines_of(path, _SAMPLE_BYTES)
+
+
+def lines_of(path: Path, limit: int = -1) -> list[str]:
     """Return the lines of a text file, or the complete lines in its first `limit` bytes."""
     raw = bytes_of(path, limit)
     if len(raw) == limit and b"\n" in raw:

@@ -1,5 +1,6 @@
 """Units of log columns: their conversion to SI units, with a check of the dimension."""
 
+import re
 from contextlib import suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,10 @@ KNOWN = (
     *("s", "ms", "us", "ns", "min", "m", "mm", "cm", "inch", "rad", "deg", "rev", "rad/s", "deg/s"),
     *("rpm", "rev/s", "m/s", "mm/s", "A", "mA", "V", "mV", "tick", "pixel", "percent", "1", "N*m"),
 )
+_LONGEST = 40
+"""Largest number of characters of a unit."""
+_POWER = re.compile(r"(\*\*|\^)(?!\s*-?\d(?![\d.]|\s*(\*\*|\^)))")
+"""A power other than one digit, such as that of 10**10**10, which would be evaluated for hours."""
 
 
 @lru_cache(maxsize=1)
@@ -63,6 +68,8 @@ def factor(unit: str, target: str) -> float:
     Raises:
         ValueError: the unit is unknown, or has another dimension than the target.
     """
+    if len(unit) > _LONGEST or _POWER.search(unit):
+        raise ValueError(f"unknown unit '{unit[:_LONGEST]}' (known: {', '.join(KNOWN)})")
     registry = _registry()
     wanted = registry.parse_units(_ALIASES.get(target, target))
     try:

@@ -109,7 +109,7 @@ class MotorFit:
         volts = [r.voltage for r in self.records if r.voltage is not None]
         return {
             "voltage": noise(volts) if volts else None,
-            "current": noise([r.current for r in self.records]),
+            "current": noise([r.amps for r in self.records]),
             "speed": noise([r.speed for r in self.records]),
         }
 
@@ -209,7 +209,7 @@ def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
     The stds of the meters' zeros are a tenth of the largest signals, and that of the inductance is
     `TIME_CONSTANT_STD_S` times the resistance.
     """
-    amps = 0.1 * max(float(np.abs(r.current).max()) for r in records)
+    amps = 0.1 * max(float(np.abs(r.amps).max()) for r in records)
     chosen = [Choice("motor.current_offset", prior_mean=0.0, prior_std=max(amps, 1e-6))]
     known = [r.voltage for r in records if r.voltage is not None]
     if known:
@@ -294,7 +294,7 @@ def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool =
     """
     where = records[0].name + (f", motor {label}" if label else "")
     speed = np.concatenate([r.speed for r in records])
-    current = np.concatenate([r.current for r in records])
+    current = np.concatenate([r.amps for r in records])
     if float(np.abs(speed).max()) > FASTEST_SHAFT:
         _fail(
             where,

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.parameter import parameter
+from slipid.support.errors import DataError
 
 BRUSH_CURRENT = 0.05
 """Current over which the voltage drop of the brushes changes its sign, as in `model.motor` [A]."""
@@ -85,7 +86,8 @@ class BenchRecord:
         sha256: hash of its file.
         time: time of each row, increasing [s].
         voltage: voltage across the motor, or its mean over the PWM; None if not logged [V].
-        current: current, with the sign of the speed if the ammeter shows magnitudes [A].
+        current: current, with the sign of the speed if the ammeter shows magnitudes; None if not
+            logged [A].
         speed: speed of the motor shaft [rad/s].
         signed: False if the ammeter shows magnitudes.
     """
@@ -94,9 +96,20 @@ class BenchRecord:
     sha256: str
     time: Float[np.ndarray, " row"]
     voltage: Float[np.ndarray, " row"] | None
-    current: Float[np.ndarray, " row"]
+    current: Float[np.ndarray, " row"] | None
     speed: Float[np.ndarray, " row"]
     signed: bool = True
+
+    @property
+    def amps(self) -> Float[np.ndarray, " row"]:
+        """Current [A]; raises `DataError` if it was not logged."""
+        if self.current is None:
+            raise DataError(
+                f"{self.name}: no column for the current: voltage and speed alone tell kS, kV and "
+                "kA (the voltages for friction, speed and acceleration), which slipid does not fit "
+                "yet; expected --current with the column of the motor's current"
+            )
+        return self.current
 
     @property
     def period(self) -> float:

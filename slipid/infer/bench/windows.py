@@ -86,10 +86,10 @@ def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | No
         if r.voltage is None:
             return None
         at = _RecordWindows(r, ELECTRICAL_S)
-        current, speed = at.mean(r.current), at.mean(r.speed)
+        current, speed = at.mean(r.amps), at.mean(r.speed)
         along = np.ones_like(speed) if r.signed else np.sign(at.long_mean(r.speed))
-        sign = np.tanh((at.long_mean(r.current) - zero * along) / BRUSH_CURRENT)
-        signals = current, speed, sign, at.slope(r.current), np.ones_like(speed), along
+        sign = np.tanh((at.long_mean(r.amps) - zero * along) / BRUSH_CURRENT)
+        signals = current, speed, sign, at.slope(r.amps), np.ones_like(speed), along
         known = np.stack(signals, 2), at.mean(r.voltage), speed, current
         parts.append(BenchWindows(*known, *at.places(k), at.driven()))
     return _joined(parts)
@@ -105,7 +105,7 @@ def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
         at = _RecordWindows(r, MECHANICAL_S)
         rows = r.speed[at.middle[:, None] + np.arange(-at.half, at.half + 1)]
         usable = at.driven() & (np.abs(rows.mean(axis=1)) > 2 * REST)
-        current, speed = at.mean(r.current), at.mean(r.speed)
+        current, speed = at.mean(r.amps), at.mean(r.speed)
         along = 1.0 if r.signed else np.sign(rows.mean(axis=1))
         signals = (
             at.slope(r.speed),
