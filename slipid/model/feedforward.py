@@ -139,7 +139,7 @@ class DriveNumbers(NamedTuple):
     efficiency: float | Array = 1.0
     gear_ratio: float | Array = 1.0
 
-    def gains(self) -> Float[Array, "3"]:
+    def gains(self) -> Float[Array, "3 *draw"]:
         """Return kS [V], kV [V s/rad] and kA [V s^2/rad]."""
         constant = self.gear_ratio * self.efficiency * self.back_emf
         dry = self.coulomb_friction / constant
