@@ -28,6 +28,10 @@ Z95 = 1.6448536269514722
 """The 95 % quantile of a standard Gaussian."""
 MATTERS = 0.05
 """Smallest share of a number in the variance of a gain at which its verdict counts [1]."""
+NEGLIGIBLE = 0.05
+"""Part of the std of a gain, relative to the value, up to which it is negligible [1]."""
+ELECTRIC = ("resistance", "back_emf")
+"""Names of the numbers whose verdicts count however small their parts are."""
 ORDER = ("fixed", "identified", "weak", "disputed", "at_bound", "not_identified")
 """Verdicts, the strongest first; a gain has the weakest of the numbers that matter."""
 USEFUL = 0.3
@@ -195,7 +199,7 @@ def feedforward(
     r = np.eye(len(given)) if correlation is None else correlation
     stds = np.sqrt(np.maximum(np.einsum("gi,ij,gj->g", scaled, r, scaled), 0.0))
     kS, kV, kA = (
-        Gain.of(float(value), float(std), unit, weakest(list(row), given))
+        Gain.of(float(value), float(std), unit, _verdict(float(value), row.tolist(), numbers))
         for value, std, unit, row in zip(
             np.asarray(values), stds, ("V", "V*s/rad", "V*s^2/rad"), scaled, strict=True
         )
@@ -213,15 +217,25 @@ def _linearised(names: tuple[str, ...], values: Array) -> tuple[Array, Array]:
     return of(values), jax.jacfwd(of)(values)
 
 
-def weakest(parts: Sequence[float], numbers: Sequence[Known]) -> str:
+def _verdict(value: float, parts: Sequence[float], numbers: Mapping[str, Known]) -> str:
     """Return the weakest verdict of the numbers that matter for a gain.
 
-    `parts` are the stds of the gain due to each of the numbers. If no number has a std, all of them
-    were given, and so is the gain.
+    A number matters if its share in the variance is more than `MATTERS`, unless its part is
+    negligible beside the gain; parts of resistance and back-EMF never are, so that a motor of which
+    priors alone tell has gains with that verdict.
+
+    Args:
+        value: value of the gain.
+        parts: std of the gain due to each of the numbers.
+        numbers: the numbers.
     """
     squares = np.square(parts)
     whole = float(squares.sum())
     if not isfinite(whole):
         return ORDER[-1]
-    mattering = [n.verdict for n, q in zip(numbers, squares, strict=True) if q > MATTERS * whole]
-    return max(mattering, key=ORDER.index, default="fixed")
+    mattering = [
+        number.verdict
+        for (name, number), square in zip(numbers.items(), squares, strict=True)
+        if square > MATTERS * whole and (name in ELECTRIC or square > (NEGLIGIBLE * value) ** 2)
+    ]
+    return max(mattering, key=ORDER.index, default="identified" if whole > 0 else "fixed")

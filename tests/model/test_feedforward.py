@@ -113,6 +113,16 @@ def test_a_gain_has_the_weakest_verdict_of_the_numbers_that_matter():
     assert feedforward("wheel", exact(WHEEL)).kA.verdict == "fixed"
 
 
+def test_a_number_that_hardly_changes_a_gain_does_not_spoil_its_verdict():
+    """Friction per speed is the only uncertain part of kV, and a hundredth of it."""
+    unknown = Known(0.005, 0.005, "not_identified")
+    found = feedforward("wheel", exact(WHEEL) | {"viscous_friction": unknown})
+    assert found.kV.std < 0.05 * found.kV.value
+    assert found.kV.verdict == "identified"
+    prior = Known(1.8, 0.01, "not_identified")
+    assert feedforward("wheel", exact(WHEEL) | {"resistance": prior}).kA.verdict == prior.verdict
+
+
 def test_an_interval_of_a_positive_gain_stays_positive():
     low, high = Gain.of(0.1, 0.2, "V", "weak").interval90
     assert 0 < low < 0.1 < high
