@@ -127,9 +127,19 @@ class Feedforward:
 
 
 class DriveNumbers(NamedTuple):
-    """Numbers of a motor and its load that gains follow from; inertia is that behind the gear.
+    """Numbers of a motor and of its load, from which feed-forward gains follow.
 
-    Friction and `load_inertia` are at the output of the gear, `rotor_inertia` at the shaft.
+    Attributes:
+        resistance: R [ohm].
+        back_emf: C_e at the shaft [V s/rad].
+        coulomb_friction: tau_c at the output of the gear [N m].
+        viscous_friction: b at the output of the gear [N m s/rad].
+        rotor_inertia: J_m at the shaft [kg m^2].
+        load_inertia: J_load at the output of the gear [kg m^2].
+        brush_drop: V_b [V].
+        brush_current: I_b, over which the drop of the brushes builds up [A].
+        efficiency: eta of the gear [1].
+        gear_ratio: n, motor speed over the speed at the output of the gear [1].
     """
 
     resistance: float | Array
