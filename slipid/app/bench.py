@@ -20,9 +20,11 @@ from slipid.data.reading.motor_layout import GivenColumns, MotorOptions
 from slipid.data.reading.motor_log import read_motor_logs
 from slipid.data.reading.reader import read_logs
 from slipid.data.runs import counted_once
+from slipid.exports.feedforward import gains_json, write_gains
 from slipid.infer.bench.fit import check_records, fit_motor
 from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
 from slipid.infer.bench.verdict import BenchFit, bench_fit
+from slipid.infer.feedforward import bench_feedforwards
 from slipid.parameter import entries
 from slipid.search_space import Choice
 from slipid.support.content import Content
@@ -245,8 +247,9 @@ def identify_bench(
     task = read_bench_task(config, data, report)
     fit = task.fit(report)
     writable(out)
-    content = fit.to_json()
+    content = bench_content(fit)
     write_json(out / "identified.json", content)
+    gains = write_gains(out, bench_feedforwards(fit))
 
     inputs: Content = {
         "folder": str(data),
@@ -255,7 +258,12 @@ def identify_bench(
         "skipped": task.skipped,
     }
     of_config.write_run_file(out, config, inputs, time.monotonic() - began, {})
-    return fit, ("identified.json", "run.json", "config.toml")
+    return fit, ("identified.json", *gains, "run.json", "config.toml")
+
+
+def bench_content(fit: BenchFit) -> Content:
+    """Return the content of the result file of motors, with their feed-forward gains."""
+    return fit.to_json() | gains_json(bench_feedforwards(fit))
 
 
 def check_bench(

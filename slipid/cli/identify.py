@@ -62,6 +62,7 @@ def identify(
     from slipid.app.identify import IdentifyResult, checked_task
     from slipid.report.calibration import show_calibration, show_trust
     from slipid.report.estimates import show_fit
+    from slipid.report.gains import show_gains
     from slipid.support.files import read_json
 
     wanted = read_config(config)
@@ -86,6 +87,7 @@ def identify(
     def show(page: "Page") -> None:
         if isinstance(done, IdentifyResult):
             show_fit(page, done.fit, done.profiles)
+            show_gains(page, content)
         else:
             show_calibration(page, done.calibration)
         show_trust(page, done.trust)
@@ -168,7 +170,7 @@ def bench(
     config: "Config", data: Path, out: Path, profile: Sequence[str], json: str | None, quiet: bool
 ) -> int:
     """Identify motors on a bench, write and print the result, and return the exit code."""
-    from slipid.app.bench import identify_bench
+    from slipid.app.bench import bench_content, identify_bench
     from slipid.report.estimates import show_bench
     from slipid.report.html.bench_page import bench_page
     from slipid.report.html.page import REPORT, try_page
@@ -183,5 +185,5 @@ def bench(
             written = (*written, *(path.name for path in bench_plots(fit, out)))
         page = bench_page(fit, config.path.name)
         written = (*try_page(page, out / REPORT, report), *written)
-    emit(json, fit.to_json(), lambda page: show_bench(page, fit), [PRIORS], out, written)
+    emit(json, bench_content(fit), lambda page: show_bench(page, fit), [PRIORS], out, written)
     return 0 if fit.good else 1

@@ -67,10 +67,11 @@ def motor(
     by their names; a given channel replaces its alternatives, and :-UNIT reverses a sign. Channels
     may be in other files with other rates but the same clock. For several motors, separate their
     columns by commas. Speeds are those of the motor shaft unless --gear is given; a gear cannot be
-    detected. With --out, the command writes report.html, motor.json and a picture. The exit code is
-    1 if the model does not explain the log.
+    detected. With --out, the command writes report.html, motor.json, a picture, and feed-forward
+    gains as a header in C and as ROS 2 parameters. The exit code is 1 if the model does not explain
+    the log.
     """
-    from slipid.app.bench import read_motor_log
+    from slipid.app.bench import bench_content, read_motor_log
     from slipid.data.reading.motor_layout import MotorOptions, given_columns
     from slipid.report.estimates import show_bench
     from slipid.support.files import write_json
@@ -97,12 +98,15 @@ def motor(
         report.stage("reading the log")
         task = read_motor_log(file, given, delimiter, options)
         fit = task.fit(report)
-        content, written = fit.to_json(), ["motor.json"]
+        content, written = bench_content(fit), ["motor.json"]
         if out is not None:
+            from slipid.exports.feedforward import write_gains
+            from slipid.infer.feedforward import bench_feedforwards
             from slipid.report.html.bench_page import bench_page
             from slipid.report.html.page import REPORT, try_page
 
             write_json(out / "motor.json", content)
+            written += write_gains(out, bench_feedforwards(fit))
             if can_draw(report):
                 from slipid.plots.bench import bench_plots
 

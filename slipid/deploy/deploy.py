@@ -13,7 +13,9 @@ import numpy as np
 
 from slipid.data.runs import Runs
 from slipid.deploy.robot_record import effects_by_load, robot_record
+from slipid.exports.feedforward import gains_json
 from slipid.fitting.calibration.result import Calibration
+from slipid.infer.fit_file import IDENTIFIED, write_identified
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.result import Fit, draws
 from slipid.infer.verdicts.estimates import Estimate
@@ -24,6 +26,7 @@ from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot.controller import NO_CONTROLLER
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.feedforward import robot_feedforwards
 from slipid.robot.gains import known_actuator
 from slipid.robot.interface import MIXED_FLOORS_PENALTY
 from slipid.robot.record import (
@@ -47,7 +50,7 @@ from slipid.robot.twin import LONGEST_DELAY_S, ActuatorModel
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
-from slipid.support.files import hash_of
+from slipid.support.files import hash_of, read_json
 
 ROBOT = "robot.json"
 DRAWS = 64
@@ -277,8 +280,14 @@ def _settings(given: Mapping[str, tuple[float, str]]) -> dict[str, Setting]:
 
 
 def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
-    """Write robot.json into the folder of a fit; return the names of the written files."""
-    deploy(found).save(out / ROBOT)
+    """Write robot.json into the folder of a fit; return the names of the written files.
+
+    The feed-forward and feedback gains of the robot are added to identified.json.
+    """
+    robot = deploy(found)
+    robot.save(out / ROBOT)
+    gains = gains_json(robot_feedforwards(robot))
+    write_identified(out, read_json(out / IDENTIFIED, "the result of a fit") | gains)
     return (ROBOT,)
 
 

@@ -83,7 +83,7 @@ class NumberRow:
         return f"**{self.verdict}**" if warned else self.verdict
 
 
-def verdict_text(verdict: Verdict) -> str:
+def verdict_text(verdict: str) -> str:
     """Return a verdict as text for people, in capitals if users must be warned of it."""
     words = verdict.replace("_", " ")
     return words.upper() if verdict in WARNINGS else words

@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from slipid.report.calibration import show_calibration
+from slipid.report.gains import show_gains
 from slipid.report.numbers import interval, rounded
 from slipid.report.page import Groups, Page, counted, grouped, in_two_lines, table, verdict
 from slipid.support.content import Content
@@ -216,6 +217,9 @@ def show_bench(page: Page, fit: "BenchFit", taken: Sequence[str] = ()) -> None:
 
     `taken` has sentences about the columns of the log that were used.
     """
+    from slipid.exports.feedforward import gains_json
+    from slipid.infer.feedforward import bench_feedforwards
+
     if taken:
         page.line(f"columns: {'; '.join(taken)}")
     rows = sum(len(r.time) for f in fit.fits for r in f.records)
@@ -223,6 +227,7 @@ def show_bench(page: Page, fit: "BenchFit", taken: Sequence[str] = ()) -> None:
     title = f"{motors}{rows} rows; all values refer to the motor shaft"
     show_estimates(page, fit.parameters.values(), title)
     show_ratios(page, fit.derived.values())
+    show_gains(page, gains_json(bench_feedforwards(fit)))
     page.notes(fit.messages)
     ended = "converged" if fit.converged else "NOT converged"
     model = "" if fit.good or not fit.converged else "; the model does NOT explain the log"

@@ -83,6 +83,11 @@ def test_a_file_without_options(bench):
     assert found["schema"] == "slipid.identified/1"
     assert found["parameters"]["motor.resistance"]["value"] == pytest.approx(5.5, rel=0.02)
     assert (bench / "single" / "bench.png").stat().st_size > 10_000
+    kV = found["feedforward"]["motor"]["kV"]
+    assert kV["value"] == pytest.approx(0.0514 + 5.5 * 2e-5 / 0.0514, rel=0.01)
+    assert found["feedback"]["motor"]["velocity_kP"]["value"] > 0
+    assert repr(kV["value"]) in (bench / "single" / "motor_feedforward.h").read_text()
+    assert repr(kV["value"]) in (bench / "single" / "motor_feedforward.yaml").read_text()
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from slipid.support.progress import Reporter
 from tests.helpers import small_twin
 from tests.helpers.compiled_c import NEEDS_COMPILER
 from tests.helpers.kinds import SHAPES, deployed
+from tests.helpers.known_gains import fitted_motors
 from tests.helpers.shared import invoke
 
 ROBOT = small_twin.deployed(1.0, 1.0, 0.3)
@@ -104,6 +105,24 @@ def test_every_drive_is_tried_and_exported_from_the_command_line(kind, tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
     forms = {path.name for path in (tmp_path / "to_go").iterdir() if path.is_dir()}
     assert forms == set(FORMS)
+
+
+@pytest.mark.slow
+@NEEDS_COMPILER
+def test_a_robot_with_fitted_motors_brings_their_gains(folder, tmp_path):
+    robot, out = fitted_motors("omni 4"), tmp_path / "robot"
+    options = ExportOptions(("c", "ros2"), controller="slip_odometry")
+    export(robot, out, options, QUIET)
+    assert "c/src/motor_feedforward.h" in check_folder(out)
+    assert "motor_feedforward.h" in (out / "c/README.md").read_text()
+    assert "feedforward:" in (out / "ros2/slipid.yaml").read_text()
+    flags = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only")
+    words = ["cc", *flags, "-x", "c", out / "c/src/motor_feedforward.h"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    # the other robot was not fitted
+    assert not (folder / "c/src/motor_feedforward.h").exists()
+    assert "motor_feedforward.h" not in (folder / "c/README.md").read_text()
 
 
 @pytest.mark.slow

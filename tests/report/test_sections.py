@@ -6,6 +6,8 @@ import os
 import pytest
 
 from slipid.app.reference_robots import reference_robot
+from slipid.exports.feedforward import gains_json
+from slipid.model.feedforward import Feedforward, Gain
 from slipid.report.html.blocks import CopyLines, FigureBlock, TableBlock, TextBlock
 from slipid.report.html.evidence import FitEvidence, Quarters, write_evidence
 from slipid.report.html.fit_page import fit_page
@@ -134,6 +136,20 @@ def test_numbers_that_the_logs_do_not_determine_are_remarks_in_what_is_copied(fo
     assert any("off by 0.4 % of the path" in line for line in lines)
     live = [line for line in lines if line and not line.startswith("#")]
     assert all("not identified" not in line for line in live)
+
+
+def test_gains_of_a_robot_have_a_section(folder):
+    assert "feedforward" not in page_of(folder)
+    identified = json.loads((folder / "identified.json").read_text())
+    parts = (Gain.of(1.0, 0.1, unit, "weak") for unit in ("V", "V*s/rad", "V*s^2/rad"))
+    identified |= gains_json([Feedforward("linear", *parts, radius=0.05)])
+    (folder / "identified.json").write_text(json.dumps(identified))
+    blocks = page_of(folder)["feedforward"]
+    (table,) = (b for b in blocks if isinstance(b, TableBlock))
+    name, value, unit, ends, word, rotation, metre = table.rows[1]
+    assert (name, value, unit, word.text) == ("linear: kV", "1.00", "V*s/rad", "weak")
+    assert (ends, rotation, metre) == ("0.85 to 1.18", "6.3", "20.0")
+    assert "Feedback of linear: velocity loop kP" in words(blocks)
 
 
 def test_values_say_what_was_learnt_what_to_do_and_what_is_measured_twice(folder):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 from rich.table import Table
 
+from slipid.exports.feedforward import gains_json
 from slipid.fitting.calibration.result import Calibration, MotionNoise, Value
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.infer.verdicts.trust import Trust
+from slipid.model.feedforward import Feedforward, Gain
 from slipid.predict.selection import FloorSelection
-from slipid.report import answers, calibration, checks, estimates
+from slipid.report import answers, calibration, checks, estimates, gains
 from slipid.report.numbers import interval, rounded
 from slipid.report.page import MOST_NOTES, WIDTH, Page, grouped, table
 
@@ -134,6 +137,16 @@ def show_bench_check(page):
     checks.show_bench_check(page, content)
 
 
+def show_gains(page):
+    units = ("V", "V*s/rad", "V*s^2/rad")
+    parts = (
+        Gain.of(value, value / 30, unit, "not_identified")
+        for value, unit in zip((0.4123, 0.05373, 0.000107312), units, strict=True)
+    )
+    found = Feedforward("linear", *parts, radius=0.0512)
+    gains.show_gains(page, gains_json([found, replace(found, name="angular")]))
+
+
 MODELS = ("nominal", "calibrated", "identified", "selected", "heading_lookup", "monotone_spline")
 
 
@@ -184,6 +197,7 @@ SHOWN = {
     "check": show_check,
     "selftest": show_selftest,
     "bench check": show_bench_check,
+    "gains": show_gains,
     "validation": show_validation,
     "comparison": show_comparison,
     "design": show_design,

@@ -11,11 +11,13 @@ from jaxtyping import Float
 from slipid.exports.c99.code import Code
 from slipid.exports.c99.text import wrapped
 from slipid.exports.description import facts, made_with, warned
+from slipid.exports.feedforward import HEADER, c_header
 from slipid.exports.fields import Struct
 from slipid.exports.golden import golden
-from slipid.exports.text import filled
+from slipid.exports.text import filled, template
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.feedforward import robot_feedforwards
 from slipid.robot.trajectory import Path
 
 FILLED_FILES = (
@@ -123,6 +125,7 @@ def c_files(
     state, stack = (f"{numbers * 8 / 1024:.1f} KiB" for numbers in (code.kept, code.scratch))
     corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
     x, y, heading = np.asarray(path.rows)[0, :3].tolist()
+    gains = robot_feedforwards(robot)
     run: dict[str, str] = {}
     example = ""
     if recording is not None:
@@ -135,6 +138,7 @@ def c_files(
         "WARNINGS": warned(robot),
         "HEAD": facts(robot),
         "RECORDING": example,
+        "FEEDFORWARD": template("c99/feedforward.md") if gains else "",
         "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
         "WHEELS": str(robot.wheels),
         "DRIVES": str(robot.drives),
@@ -145,4 +149,6 @@ def c_files(
         f"[m] in {path.duration:g} s",
     }
     others = {name: filled(f"c99/{name.rpartition('/')[2]}", values) for name in FILLED_FILES}
+    if gains:
+        others[f"src/{HEADER}"] = c_header(gains)
     return {"src/slipid.h": code.header(), "src/slipid.c": code.source(), **others, **run}

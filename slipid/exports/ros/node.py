@@ -11,10 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.exports.description import BASES, SETTINGS, gains_origin, settings, verdict_text
+from slipid.exports.feedforward import gain_parameters
 from slipid.exports.ros.yaml_text import Check, Parameter
 from slipid.exports.text import identifiers, interval, listed
 from slipid.parameter import Entry
 from slipid.robot.deployed import DeployedRobot
+from slipid.robot.feedforward import robot_feedforwards
 from slipid.robot.gains import Gains, used_gains
 from slipid.robot.record import UNITS, RecordedNumber
 from slipid.robot.robot_file import declared_numbers
@@ -24,7 +26,8 @@ NODE = "slipid"
 
 def node_parameters(robot: DeployedRobot) -> tuple[Parameter, ...]:
     """Return all parameters of the node; parameters of the same group follow one another."""
-    return (*_choices(robot), *_numbers(robot), *_shape(robot), *_errors(robot), *_controls(robot))
+    robot_itself = (*_choices(robot), *_numbers(robot), *_shape(robot), *_errors(robot))
+    return (*robot_itself, *_controls(robot), *gain_parameters(robot_feedforwards(robot)))
 
 
 def _choices(robot: DeployedRobot) -> Iterator[Parameter]:

@@ -4,10 +4,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from slipid.exports.feedforward import gains_json
 from slipid.infer.bench.fit import MotorFit
 from slipid.infer.bench.moments import Equation
 from slipid.infer.bench.verdict import BenchFit
 from slipid.infer.bench.windows import BenchWindows
+from slipid.infer.feedforward import bench_feedforwards
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.report.html import figures as draw
 from slipid.report.html.blocks import (
@@ -24,6 +26,7 @@ from slipid.report.html.blocks import (
     spanned,
 )
 from slipid.report.html.page import WebPage
+from slipid.report.html.sections.gains import gains_section
 from slipid.report.numbers import estimate
 from slipid.support.content import Content
 
@@ -41,6 +44,7 @@ def bench_page(fit: BenchFit, name: str, taken: Sequence[str] = ()) -> WebPage:
     """
     word = "explains the log" if fit.good else "does not explain the log"
     rows = sum(len(r.time) for f in fit.fits for r in f.records)
+    gains = gains_section(gains_json(bench_feedforwards(fit)))
     motors = "motor" if len(fit.fits) == 1 else f"{len(fit.fits)} motors"
     return WebPage(
         title=f"{name}: {motors} on a bench",
@@ -50,6 +54,7 @@ def bench_page(fit: BenchFit, name: str, taken: Sequence[str] = ()) -> WebPage:
             _verdict(fit),
             _numbers(fit, name),
             _values(fit),
+            *([] if gains is None else [gains]),
             *(_signals(f) for f in fit.fits),
             _origin(fit, taken),
         ],

@@ -14,7 +14,7 @@ from slipid.report.html.evidence import EVIDENCE, FitEvidence, write_evidence
 from slipid.report.html.gather import evidence_of_fit, evidence_of_runs
 from slipid.report.html.page import REPORT, WebPage, try_page, write_page
 from slipid.report.html.results import Results, read_results
-from slipid.report.html.sections import data, others, outlook, predictions, summary, wheels
+from slipid.report.html.sections import data, gains, others, outlook, predictions, summary, wheels
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -22,6 +22,7 @@ SECTIONS = (
     summary.verdict,
     summary.numbers,
     summary.values,
+    gains.gains,
     predictions.held_out,
     predictions.paths,
     predictions.residuals,
