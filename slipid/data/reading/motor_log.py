@@ -51,7 +51,7 @@ class MotorLogs:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class _FileRows:
     """Rows of one file with its layout, and the column of pulses if the file has it."""
 
     table: Table
@@ -108,7 +108,7 @@ def _used(channel: str, one: Channel, place: str, options: MotorOptions) -> str:
     return f"{line}{behind}, taken as that of the motor's shaft"
 
 
-def _read(file: MotorFile, layout: Layout) -> _Rows:
+def _read(file: MotorFile, layout: Layout) -> _FileRows:
     """Return the rows of a file; fast rows are averaged, and those of one time are united."""
     table = file.rows(layout)
     pulses = layout.channels.get(PULSES)
@@ -117,7 +117,7 @@ def _read(file: MotorFile, layout: Layout) -> _Rows:
     if "time" in rest and np.isfinite(times_of(table, layout)).all():
         table = _thinned(table, times_of(table, layout))
         table = table.rows(np.append(np.diff(times_of(table, layout)) != 0, True))
-    return _Rows(table, layout, pulses)
+    return _FileRows(table, layout, pulses)
 
 
 def _thinned(table: Table, time: Float[np.ndarray, " row"]) -> Table:
@@ -131,7 +131,7 @@ def _thinned(table: Table, time: Float[np.ndarray, " row"]) -> Table:
     return replace(first, values=values)
 
 
-def _beside(file: MotorFile, given: Mapping[str, GivenColumns], options: MotorOptions) -> _Rows:
+def _beside(file: MotorFile, given: Mapping[str, GivenColumns], options: MotorOptions) -> _FileRows:
     """Return the rows of another file than the main one.
 
     A file of pulse times needs no other time.
@@ -145,7 +145,7 @@ def _beside(file: MotorFile, given: Mapping[str, GivenColumns], options: MotorOp
     return _read(file, layout_of(file.format, channels, options))
 
 
-def _run(name: str, main: _Rows, others: list[_Rows], options: MotorOptions) -> RawRun:
+def _run(name: str, main: _FileRows, others: list[_FileRows], options: MotorOptions) -> RawRun:
     """Return a test of the main file as a run, with the channels of the other files."""
     notes: list[str] = []
     every, signals = [main, *others], dict[str, Signal]()
@@ -244,7 +244,7 @@ def _pulse_speed(pulses: Signal, volts: Signal, options: MotorOptions) -> Signal
     return Signal(volts.time, (np.sign(volt[latest]) * speed)[:, None], volts.source)
 
 
-def _pulses(rows: _Rows) -> Signal:
+def _pulses(rows: _FileRows) -> Signal:
     """Return the number of pulses until the time of each pulse.
 
     The column has the times of the pulses, or a count of pulses, or a level that changes between
