@@ -208,7 +208,7 @@ def test_units_of_guesses(tmp_path, lines, expected):
 
 
 def test_columns_of_parquet_and_columns_without_names(tmp_path):
-    pyarrow = pytest.importorskip("pyarrow")
+    pyarrow = pytest.importorskip("pyarrow", reason="Parquet files need the extra parquet")
     from pyarrow import parquet
 
     path = tmp_path / "log.parquet"

@@ -86,7 +86,7 @@ def _order(lines: list[str], rng: np.random.Generator) -> list[str]:
 
 
 def _blank(lines: list[str], rng: np.random.Generator) -> list[str]:
-    """Insert empty or strange lines."""
+    """Insert lines that are empty or of other kinds than the rest."""
     at = int(rng.integers(len(lines)))
     return [
         *lines[:at],

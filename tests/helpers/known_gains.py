@@ -18,7 +18,7 @@ STDS = {
 }
 """Std of each fitted number of the motor, relative to its value."""
 CORRELATION = 0.8
-"""Of the logarithms of resistance and friction."""
+"""Correlation of the logarithms of resistance and friction."""
 
 
 def fitted_motors(kind: str = "differential", draws: int = 4000, **more: object) -> DeployedRobot:

@@ -51,7 +51,7 @@ COUNTS = np.array([48, 64, 256, 400, 1024, 2000, 4096, 8192])
 
 @dataclass(frozen=True)
 class Kind:
-    """What a bench has.
+    """Properties of a bench.
 
     Attributes:
         drop: shape of the brush drop, as in `DROPS`.
@@ -81,7 +81,7 @@ class Kind:
 
     @property
     def plain(self) -> bool:
-        """Whether the motor has no effect; supply and meters may have any of theirs."""
+        """True if the motor has no effect; supply and meters may have any of theirs."""
         effects = (self.film, self.heat, self.cogging, self.stribeck, self.ripple)
         return self.drop in PLAIN_DROPS and not any(effects)
 
@@ -128,7 +128,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Meters:
-    """What logs a bench.
+    """Instruments that log a bench.
 
     Attributes:
         current_range, current_noise, current_offset: [A].

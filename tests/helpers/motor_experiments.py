@@ -14,7 +14,7 @@ EXCITATIONS = {"steps": 0.4, "random": 0.25, "sweep": 0.15, "quasi-static": 0.2}
 
 @dataclass(frozen=True)
 class Plan:
-    """What an experiment has to fit into.
+    """Limits of an experiment.
 
     No current exceeds that of the stalled motor at the largest voltage by more than what is left
     of a transient: a level is held until the speed follows it before the voltage moves by more

@@ -321,7 +321,7 @@ def test_a_data_log_that_was_cut_off_is_read_up_to_its_last_record(tmp_path):
 
 
 def test_tests_in_a_parquet_file(tmp_path):
-    pyarrow = pytest.importorskip("pyarrow")
+    pyarrow = pytest.importorskip("pyarrow", reason="Parquet files need the extra parquet")
     from pyarrow import parquet
 
     s, path = made.signals(), tmp_path / "log.parquet"

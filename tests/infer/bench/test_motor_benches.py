@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from dataclasses import replace
 
@@ -12,9 +11,10 @@ from scipy.optimize import brentq
 from scipy.signal import step
 
 from tests.helpers import motor_benches as made
+from tests.helpers.compiled_c import NEEDS_COMPILER
 from tests.helpers.motor_physics import Drop, Motor, States, Supply, simulate, substeps
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+pytestmark = NEEDS_COMPILER
 
 PLAIN = Motor(
     voltage=12.0,
