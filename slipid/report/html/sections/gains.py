@@ -8,12 +8,12 @@ from slipid.report.html.results import Results
 from slipid.support.content import Content
 
 ABOUT = (
-    f"Voltage for a wanted speed w and acceleration: {EQUATION}. kS overcomes dry friction, and "
-    "acts against the acceleration at standstill."
+    f"Voltage for a wanted speed w and acceleration: {EQUATION}. kS overcomes dry friction; "
+    "at standstill it has the sign of the acceleration."
 )
 ROBOT = (
-    "Speeds are those of a wheel, and a metre is one that its rim rolls. `linear` and `linear_y` "
-    "are gains for motion ahead and to the left, `angular` those for turning; their kA differ by "
+    "Speeds are those of a wheel, and a metre is one that its rim rolls. linear and linear_y "
+    "are gains for motion ahead and to the left, angular those for turning; their kA differ by "
     "the inertia that a motor moves. Add to kS what a floor itself resists."
 )
 """Sentences about gains of a robot."""
