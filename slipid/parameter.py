@@ -41,6 +41,7 @@ class Declaration:
         shares: True if the elements of the array are positive fractions that sum to one.
         deviation: True if the elements of the array sum to zero and represent effects missing in
             the model; their common std is estimated from the data, up to about `spread`.
+        closed: True if a fixed value may be the lower bound, such as a friction of 0.
         doc: meaning of the parameter, in one line.
         electric: True if the parameter is estimated from currents and voltages given the motion,
             not from the motion.
@@ -56,6 +57,7 @@ class Declaration:
     free: bool = True
     shares: bool = False
     deviation: bool = False
+    closed: bool = False
     doc: str = ""
     electric: bool = False
     of: str = "wheel"
@@ -70,16 +72,18 @@ class Declaration:
         """True if the sum of the elements is given: n elements then have n - 1 coordinates."""
         return self.shares or self.deviation
 
-    def broken_rule(self, x: np.ndarray) -> str | None:
+    def broken_rule(self, x: np.ndarray, fixed: bool = False) -> str | None:
         """Return the rule that the values `x` break, as a string; None if the values are valid."""
+        lowest = fixed and self.closed
         if self.deviation:
             kept, rule = abs(x.sum()) < 1e-6, "numbers that sum to 0"
         elif self.shares:
             kept = (x > 0).all() & (abs(x.sum() - 1) < 1e-6)
             rule = "positive fractions that sum to 1"
         else:
-            kept = ((x > self.lower) & (x < self.upper)).all()
-            rule = f"inside ({self.lower:g}, {self.upper:g}) {self.unit}"
+            above = x >= self.lower if lowest else x > self.lower
+            kept = (above & (x < self.upper)).all()
+            rule = f"inside {'[' if lowest else '('}{self.lower:g}, {self.upper:g}) {self.unit}"
         return None if kept else rule
 
     def to_search(self, value: Any) -> np.ndarray:

@@ -191,7 +191,7 @@ def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any,
     is_free, mean_si, std_si = d.free, None, None
     for c in picked:
         if c.fixed is not None:
-            value, is_free = _checked_value(entry, c.fixed), False
+            value, is_free = _checked_value(entry, c.fixed, fixed=True), False
         if c.start is not None:
             value = _checked_value(entry, c.start)
         if c.prior_mean is not None or c.prior_std is not None:
@@ -201,7 +201,7 @@ def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any,
             is_free = True
         if c.free is not None:
             is_free = c.free
-    value = _checked_value(entry, value)
+    value = _checked_value(entry, value, fixed=not is_free)
     mean = d.to_search(usual if mean_si is None else mean_si)
     if std_si is None:
         spread = np.full(entry.coordinates, d.spread)
@@ -231,12 +231,12 @@ def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
     return x
 
 
-def _checked_value(entry: Entry, value: Any) -> np.ndarray:
+def _checked_value(entry: Entry, value: Any, fixed: bool = False) -> np.ndarray:
     """Return a value as an array; `ValueError` if invalid. A scalar applies to all elements."""
     x = np.asarray(value, float)
     if x.size not in (1, entry.size):
         raise ValueError(f"{entry.path}: {x.size} values; expected {entry.size}")
     x = np.broadcast_to(x.ravel(), (entry.size,))
-    if rule := entry.declaration.broken_rule(x):
+    if rule := entry.declaration.broken_rule(x, fixed):
         raise ValueError(f"{entry.path} = {value}: expected {rule}")
     return x.reshape(()) if entry.size == 1 else x

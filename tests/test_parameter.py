@@ -142,3 +142,12 @@ def test_every_declaration_has_a_unit_and_starts_inside_its_bounds():
         assert d.spread > 0
         value = np.asarray(e.get(robot))
         assert ((value > d.lower) & (value < d.upper)).all(), e.path
+
+
+def test_a_fixed_value_may_be_the_bound_of_a_closed_range():
+    zero = np.zeros(1)
+    closed = declaration(lower=0.0, closed=True)
+    assert closed.broken_rule(zero, fixed=True) is None
+    assert closed.broken_rule(zero) == "inside (0, inf) 1"
+    assert closed.broken_rule(-zero - 1.0, fixed=True) == "inside [0, inf) 1"
+    assert declaration(lower=0.0).broken_rule(zero, fixed=True) == "inside (0, inf) 1"

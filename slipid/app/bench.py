@@ -5,6 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Bool
@@ -21,14 +22,16 @@ from slipid.data.reading.motor_log import read_motor_logs
 from slipid.data.reading.reader import read_logs
 from slipid.data.runs import counted_once
 from slipid.exports.feedforward import gains_json, write_gains
-from slipid.infer.bench.fit import check_records, fit_motor
+from slipid.infer.bench.checks import check_records
+from slipid.infer.bench.fit import fit_motor
 from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
+from slipid.infer.bench.rows import Between
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.infer.feedforward import bench_feedforwards
 from slipid.parameter import entries
 from slipid.search_space import Choice
 from slipid.support.content import Content
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
@@ -47,6 +50,7 @@ class BenchTask:
         columns_used: for a single file, one line about each channel and the columns assigned to it.
         unit_is_known: True if the unit of the current was given or the config has a choice for the
             resistance, so that an unlikely current is not refused.
+        between: form of the voltage between rows, None for the likeliest.
     """
 
     records: Mapping[str, tuple[BenchRecord, ...]]
@@ -54,16 +58,22 @@ class BenchTask:
     skipped: tuple[str, ...] = ()
     columns_used: tuple[str, ...] = ()
     unit_is_known: bool = False
+    between: Between | None = None
 
     def fit(self, report: Reporter) -> BenchFit:
         """Return the fit of every motor; raise `DataError` if the records cannot be right."""
         setup_jax(quiet=True)
         for label, records in self.records.items():
+            if self.between is not None and records[0].voltage is None:
+                raise DataError(
+                    f"{records[0].name}: the voltage between rows is given ({self.between}), but "
+                    "there is no voltage; expected a column of the voltage"
+                )
             check_records(records, label, self.unit_is_known)
         fits = []
         for label, records in self.records.items():
             report.stage(f"fitting motor {label}".strip())
-            fits.append(fit_motor(records, self.choices[label], label))
+            fits.append(fit_motor(records, self.choices[label], label, self.between))
         return bench_fit(fits)
 
 
@@ -101,7 +111,8 @@ def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
     unit_is_known = any(
         fnmatch.fnmatch("motor.resistance", c.pattern) for cs in choices.values() for c in cs
     )
-    return BenchTask(records, choices, tuple(skipped), (), unit_is_known)
+    between = robot.voltage_between_rows if isinstance(robot, BenchMotors) else None
+    return BenchTask(records, choices, tuple(skipped), (), unit_is_known, between)
 
 
 def read_motor_log(
@@ -109,6 +120,7 @@ def read_motor_log(
     given: Mapping[str, GivenColumns],
     delimiter: str | None,
     options: MotorOptions,
+    between: str | None = None,
 ) -> BenchTask:
     """Return the task of motors in a single log, whose channels may be in several files.
 
@@ -118,10 +130,12 @@ def read_motor_log(
             column names.
         delimiter: character between cells, or None to guess it.
         options: properties of the log that no file tells.
+        between: form of the voltage between rows, None for the likeliest.
 
     Raises:
-        DataError: a file cannot be read, or lacks a channel.
+        DataError: a file cannot be read, or lacks a channel, or there is no such form.
     """
+    form = _form(between)
     found = read_motor_logs(path, given, delimiter, options)
     logs = counted_once(found.logs)
     refuse_misordered(logs)
@@ -129,7 +143,22 @@ def read_motor_log(
     for some in records.values():
         _check_directions(some, found.columns_used)
     unit_is_known = "current" in given and given["current"].unit is not None
-    return BenchTask(records, dict.fromkeys(records, ()), (), found.columns_used, unit_is_known)
+    none: dict[str, tuple[Choice, ...]] = dict.fromkeys(records, ())
+    return BenchTask(records, none, (), found.columns_used, unit_is_known, form)
+
+
+def _form(between: str | None) -> Between | None:
+    """Return a form of the voltage between rows; raise `DataError` if there is no such form."""
+    forms: tuple[Between, ...] = get_args(Between)
+    for form in forms:
+        if between == form:
+            return form
+    if between is None:
+        return None
+    raise DataError(
+        f"--between {between}: no form of the voltage between rows{did_you_mean(between, forms)}; "
+        f"expected one of {', '.join(forms)}"
+    )
 
 
 def _check_directions(records: Sequence[BenchRecord], used: Sequence[str]) -> None:
@@ -167,7 +196,7 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     speed = speed * layout.gear_ratio
     current = log.current
     if current is not None and not log.current_is_signed:
-        current = np.abs(current) * np.sign(speed)
+        current = np.copysign(current, speed)
     # A fit needs rows with independent errors, so only rows with new readings are used.
     return [
         BenchRecord(

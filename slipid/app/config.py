@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from slipid.infer.bench.rows import Between
 from slipid.model import geometry as g
 from slipid.model.geometry import Geometry
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
@@ -216,10 +217,14 @@ class BenchMotors(Section):
 
     Attributes:
         names: names of the motors in the order of the columns of the logs, if there are several.
+        voltage_between_rows: form of the voltage between the rows of a log: "held" until the next
+            row, "straight" from row to row, or "jumps" for a straight one that jumps between rows.
+            By default the likeliest.
     """
 
     drive: Literal["motor"]
     names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]] = Field(default_factory=list)
+    voltage_between_rows: Between | None = None
 
 
 Wheels = OmniDrive | FourWheelDrive | DifferentialDrive | SteeredDrive | GeneralDrive

@@ -54,6 +54,10 @@ def motor(
     unsigned: Annotated[
         bool, flag("--unsigned", "The logged current is a magnitude without sign.")
     ] = False,
+    between: Annotated[
+        str | None,
+        option("FORM", "Voltage between rows: held, straight or jumps; by default the likeliest."),
+    ] = None,
     delimiter: Annotated[
         str | None, option("CHARACTER", "Character between cells; guessed by default.")
     ] = None,
@@ -63,13 +67,13 @@ def motor(
 ) -> int:
     """Identify a motor on a bench from its log: resistance, back-EMF, friction and inertia.
 
-    The log needs the voltage, current and speed of the motor. Columns that are not given are found
-    by their names; a given channel replaces its alternatives, and :-UNIT reverses a sign. Channels
-    may be in other files with other rates but the same clock. For several motors, separate their
-    columns by commas. Speeds are those of the motor shaft unless --gear is given; a gear cannot be
-    detected. With --out, the command writes report.html, motor.json, a picture, and feed-forward
-    gains as a header in C and as ROS 2 parameters. The exit code is 1 if the model does not explain
-    the log.
+    The log needs the voltage, current and speed of the motor; without the current, it gives the
+    feed-forward gains alone. Columns that are not given are found by their names; a given channel
+    replaces its alternatives, and :-UNIT reverses a sign. Channels may be in other files with other
+    rates but the same clock. For several motors, separate their columns by commas. Speeds are those
+    of the motor shaft unless --gear is given; a gear cannot be detected. With --out, the command
+    writes report.html, motor.json, a picture, and feed-forward gains as a header in C and as ROS 2
+    parameters. The exit code is 1 if the model does not explain the log.
     """
     from slipid.app.bench import bench_content, read_motor_log
     from slipid.data.reading.motor_layout import MotorOptions, given_columns
@@ -96,7 +100,7 @@ def motor(
     given = {c: given_columns(text, c) for c, text in columns.items() if text is not None}
     with Reporter(quiet=quiet) as report:
         report.stage("reading the log")
-        task = read_motor_log(file, given, delimiter, options)
+        task = read_motor_log(file, given, delimiter, options, between)
         fit = task.fit(report)
         content, written = bench_content(fit), ["motor.json"]
         if out is not None:

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from slipid.report.calibration import show_calibration
 from slipid.report.gains import show_gains
+from slipid.report.held_out import held_out_sentence
 from slipid.report.numbers import interval, rounded
 from slipid.report.page import Groups, Page, counted, grouped, in_two_lines, table, verdict
 from slipid.support.content import Content
@@ -213,7 +214,7 @@ def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
 
 
 def show_bench(page: Page, fit: "BenchFit", taken: Sequence[str] = ()) -> None:
-    """Write the fitted parameters of motors on a bench, warnings, and how the fits ended.
+    """Write the fitted parameters of motors on a bench, errors, warnings, and how the fits ended.
 
     `taken` has sentences about the columns of the log that were used.
     """
@@ -228,6 +229,9 @@ def show_bench(page: Page, fit: "BenchFit", taken: Sequence[str] = ()) -> None:
     show_estimates(page, fit.parameters.values(), title)
     show_ratios(page, fit.derived.values())
     show_gains(page, gains_json(bench_feedforwards(fit)))
+    for f in fit.fits:
+        if f.held_out is not None:
+            page.line(f"{f.label}: " * bool(f.label) + held_out_sentence(f.held_out))
     page.notes(fit.messages)
     ended = "converged" if fit.converged else "NOT converged"
     model = "" if fit.good or not fit.converged else "; the model does NOT explain the log"

@@ -15,6 +15,7 @@ from slipid.data.reading.column_names import meaning_of
 from slipid.data.reading.layout import SensorLayout
 from slipid.data.reading.motor_layout import MotorOptions, given_columns, motor_layout
 from slipid.data.reading.table_format import format_of
+from slipid.infer.bench.least_squares import RIVALS
 from slipid.support.errors import DataError
 from tests.helpers import made_bench as made
 from tests.helpers import resting
@@ -24,6 +25,7 @@ CONFIG = """
 [robot]
 drive = "motor"
 names = ["left", "right"]
+voltage_between_rows = "jumps"
 [[logs]]
 glob = "*.csv"
 format = "mine"
@@ -54,7 +56,7 @@ def bench(tmp_path_factory):
     """A folder with a log of one motor, and one of two motors with its config."""
     folder = tmp_path_factory.mktemp("bench")
     rows = made.driven(made.FLYWHEEL)
-    one, two = made.logged(rows, 200, 1), made.logged(rows, 200, 1, noise=(0.1, 0.02, 2.0))
+    one, two = made.logged(rows, 100, 3), made.logged(rows, 100, 3, noise=(0.1, 0.02, 2.0))
     made.write(one, folder / "one.csv")
     (folder / "two").mkdir()
     columns = [one.time, one.voltage, one.current, one.speed, two.voltage, two.current, two.speed]
@@ -91,13 +93,17 @@ def test_a_file_without_options(bench):
 
 
 @pytest.mark.slow
-def test_json_on_stdout(bench):
-    result = invoke("motor", bench / "one.csv", "--json", "-", "--quiet")
-    assert json.loads(result.stdout)["drive"] == "motor"
+@pytest.mark.parametrize("form", ["straight", "jumps"])
+def test_the_voltage_between_rows_can_be_given(bench, form):
+    result = invoke("motor", bench / "one.csv", "--between", form, "--json", "-", "--quiet")
+    found = json.loads(result.stdout)
+    assert found["drive"] == "motor"
+    assert found["motors"]["motor"]["voltage_between_rows"] == form
 
 
+@pytest.mark.slow
 def test_units_and_delimiter(bench, tmp_path):
-    made_one = made.logged(made.driven(made.FLYWHEEL), 200, 1)
+    made_one = made.logged(made.driven(made.FLYWHEEL), 100, 3)
     table = [
         1e3 * made_one.time,
         made_one.voltage,
@@ -136,8 +142,9 @@ def test_broken_logs_are_refused(tmp_path, spoil, said):
     assert said in result.output
 
 
+@pytest.mark.slow
 def test_rows_without_a_voltage_are_left_out(tmp_path):
-    record = made.logged(made.driven(made.FLYWHEEL), 200, 1)
+    record = made.logged(made.driven(made.FLYWHEEL), 100, 3)
     early = record.time < 3
     cut = replace(
         record,
@@ -155,9 +162,10 @@ def test_rows_without_a_voltage_are_left_out(tmp_path):
     assert values[0] == pytest.approx(values[1], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_an_angle_or_a_duty_will_do(tmp_path):
     rows = made.driven(made.FLYWHEEL)
-    record = made.logged(rows, 1000, 1)
+    record = made.logged(rows, 200, 1)
     angle = np.cumsum(rows[:, 3]) * 1e-4
     at = np.interp(record.time, rows[:, 0], angle)
     path, bus = tmp_path / "log.csv", np.full(len(at), 24.0)
@@ -272,15 +280,36 @@ def test_a_motor_is_read_along_its_axis_q(name, channel):
     assert bool(meaning.doubt) == bool(channel)
 
 
-def test_a_fit_without_a_current_is_refused_with_the_reason(tmp_path):
+@pytest.mark.slow
+def test_a_log_of_sysid_without_a_current_gives_the_gains_of_the_voltage(tmp_path):
+    rows = made.driven(made.FLYWHEEL, profile=made.held)
+    record = made.logged(rows, 100, 1, at_changes=True)
+    turns = record.speed / (2 * np.pi)
+    lines = [
+        f"{time:.4f},dynamic-forward,{volts:.3f},{0.01 * angle:.4f},{speed:.4f}"
+        for time, volts, angle, speed in zip(
+            record.time, record.voltage, np.cumsum(turns), turns, strict=True
+        )
+    ]
+    path = tmp_path / "sysid.csv"
+    names = "Timestamp (s),Test,Volts (V),Position (rot),Velocity (rot/s)"
+    path.write_text("\n".join([names, *lines]))
+    result = invoke("motor", path, "--json", "-", "--quiet")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    gains = found["feedforward"]["motor"]
+    assert gains["kS"]["value"] == pytest.approx(5.5 * 0.004 / 0.0514, rel=0.03)
+    assert gains["kV"]["value"] == pytest.approx(0.0514 + 5.5 * 2e-5 / 0.0514, rel=0.01)
+    assert gains["kA"]["value"] == pytest.approx(5.5 * made.FLYWHEEL / 0.0514, rel=0.02)
+    assert found["held_out"]["current_rmse_a"] is None
+    assert any("log the motor current" in text for text in found["messages"])
+
+
+def test_speeds_in_turns_are_known_by_the_names_of_sysid(tmp_path):
     path = tmp_path / "sysid.csv"
     rows = [f"{0.02 * k},dynamic-forward,{0.1 * k},{k},{2 * k}" for k in range(12)]
     names = "Timestamp (s),Test,Volts (V),Position (rot),Velocity (rot/s)"
     path.write_text("\n".join([names, *rows]))
-    result = invoke("motor", path, "--quiet")
-    assert result.exit_code == 2
-    assert "sysid.csv: dynamic-forward: no column for the current" in result.output
-    assert "voltage and speed alone tell kS, kV and kA" in result.output
     layout = motor_layout(format_of(path), {}, MotorOptions())
     assert layout.channels["motor_speed"].unit == "rot/s"
 
@@ -293,6 +322,12 @@ def test_a_fit_without_a_current_is_refused_with_the_reason(tmp_path):
         (("--ignore", "I", "--ignore", "U"), "no column for the current or voltage"),
         (("--pulses", "w"), "only one of --pulses and --pulses-per-revolution"),
         (("--voltage", "none.csv::CH1:V"), "none.csv: cannot be read"),
+        (
+            ("--between", "hold"),
+            "--between hold: no form of the voltage between rows, did you",
+        ),
+        (("--between", "hold"), "expected one of held, straight, jumps"),
+        (("--between", "held", "--ignore", "U"), "given (held), but there is no voltage"),
         (("--speed", "w:-rad/s", "--voltage", "U:-V"), "the current has the wrong sign"),
     ],
 )
@@ -309,6 +344,8 @@ def test_two_motors_of_a_config(identified):
         r = found["parameters"][f"motor.resistance@{label}"]
         assert r["verdict"] == "identified"
         assert r["value"] == pytest.approx(5.5, rel=0.03)
+        assert found["motors"][label]["voltage_between_rows"] == "jumps"
+        assert found["held_out"][label]["rivals"].keys() == RIVALS.keys()
     assert found["parameters"]["motor.brush_drop@left"]["verdict"] == "fixed"
     assert (identified / "bench_left.png").is_file()
 
@@ -352,6 +389,12 @@ def test_a_bench_gives_a_robot_its_priors(identified):
     assert any("motor from" in line for line in lines)
 
 
+def test_a_wrong_form_of_the_voltage_in_a_config_is_refused_with_the_choices(tmp_path):
+    text = CONFIG.replace('"jumps"', '"hold"')
+    with pytest.raises(DataError, match=r"robot.*voltage_between_rows.*held.*straight.*jumps"):
+        parsed(tmp_path / "bench.toml", text)
+
+
 def test_a_bench_that_is_none_is_refused(tmp_path):
     config = parsed(tmp_path / "robot.toml", ROBOT.format(motor='motor = "b.json"'))
     with pytest.raises(DataError, match=r"b.json: No such file"):
@@ -385,3 +428,12 @@ def test_a_torque_is_no_current_of_a_motor_on_a_bench():
     log = replace(resting.runs().logs[0], current_is_torque=True)
     with pytest.raises(DataError, match=r"run00.csv: a torque in place of the current"):
         records_of(log, SensorLayout())
+
+
+def test_magnitudes_of_a_current_are_kept_where_the_shaft_rests():
+    log = resting.runs().logs[0]
+    still = np.zeros_like(log.wheel_angle)
+    log = replace(log, wheel_speed=still, current_is_signed=False)
+    record, *_ = records_of(log, SensorLayout())
+    assert np.abs(log.current[:, 0]).max() > 0
+    np.testing.assert_array_equal(record.current, np.abs(log.current[:, 0]))

@@ -46,6 +46,26 @@ def quick_steps(t: float) -> float:
     return (6.0, -6.0, 12.0, 0.0, -12.0, 9.0)[int(t / 0.1) % 6]
 
 
+RATE = 100.0
+"""Rows per second of logs whose voltage changes at rows [1/s]."""
+
+
+def at_row(k: int) -> float:
+    """Voltage of a row: steps of .3 s, with a sine on them [V]."""
+    return 0.8 * STEPS[k // 30 % len(STEPS)] + 3.0 * np.sin(0.11 * k)
+
+
+def held(t: float) -> float:
+    """The voltage of the last row, held until the next one [V]."""
+    return at_row(int(t * RATE + 1e-6))
+
+
+def straight(t: float) -> float:
+    """A voltage that is straight from row to row [V]."""
+    k, part = divmod(t * RATE + 1e-9, 1.0)
+    return at_row(int(k)) * (1 - part) + at_row(int(k) + 1) * part
+
+
 @lru_cache
 def driven(
     inertia: float,
@@ -54,10 +74,12 @@ def driven(
     profile: Callable[[float], float] = steps_and_ramps,
     dt: float = 1e-4,
     turn: float = 0.05,
+    warming: float = 0.0,
 ) -> np.ndarray:
     """Time, voltage, current, speed, step by step; dry friction holds what it can hold.
 
-    The drop of the brushes turns over the current `turn` [A].
+    The drop of the brushes turns over the current `turn` [A]; the resistance rises by the part
+    `warming` of it in a second, from the start [1/s].
     """
     drive = OpenLoop(
         MotorBuild(supply_v=48.0, supply_ohm=0.0, efficiency=1.0), SpeedLoop(), 1.0, 1, dt
@@ -67,7 +89,8 @@ def driven(
     for k in range(len(rows)):
         volts, amps = profile(k * dt), drive.current[0]
         rows[k] = k * dt, volts, amps, speed
-        (torque,) = drive.step([volts - drop * np.tanh(amps / turn)], [0.0], [speed])
+        lost = drop * np.tanh(amps / turn) + warming * k * dt * TRUTH["resistance"] * amps
+        (torque,) = drive.step([volts - lost], [0.0], [speed])
         free = speed + dt * (torque - TRUTH["viscous_friction"] * speed) / inertia
         speed = 0.0 if abs(free) <= held else free - np.sign(free) * held
     return rows
@@ -79,11 +102,16 @@ def logged(
     seed: int = 0,
     noise: tuple[float, float, float] = (0.05, 0.05, 1.0),
     quantum: tuple[float, float, float] = (0.02, 0.02, 1.0),
+    at_changes: bool = False,
 ) -> BenchRecord:
-    """Rows at a rate, with noise, offsets and rounding of voltage, current and speed."""
+    """Rows at a rate, with noise, offsets and rounding of voltage, current and speed.
+
+    The first row is at any of the first steps, or at time 0 if `at_changes` is true.
+    """
     rng = np.random.default_rng(seed)
     step = round(1 / rate / (rows[1, 0] - rows[0, 0]))
-    rows = rows[rng.integers(step) :: step]
+    first = int(rng.integers(step))
+    rows = rows[0 if at_changes else first :: step]
     offset = TRUTH["voltage_offset"], TRUTH["current_offset"], 0.0
     seen = rows[:, 1:] + offset + np.array(noise) * rng.normal(size=(len(rows), 3))
     q = np.array(quantum)

@@ -1,68 +1,78 @@
-"""Check of a motor's logs and fit of one motor: the maximum of the quasi-posterior of its moments.
+"""Fit of one motor: its open-loop simulation, the form of its model, and its uncertainty.
 
-Logs with wrong units, signs or columns are refused before the fit (`check_records`).
+The form of the voltage between rows (held, straight, or straight with jumps) is the likeliest one
+unless the user gives it. The model has a voltage drop of the brushes. A drift of the resistance
+with time is added only if its estimate is significant.
 
-With the moments g of both equations, their scatter S and Gaussian priors in the search space z,
-
-    -2 log pi(z) = g(z)^T S^-1 g(z) + |(z - mean) / std|^2 + const
-
-(Chernozhukov and Hong 2003: such a quasi-posterior may replace a posterior if only the mean of g is
-known). Weights, S and z are updated in turn. With J the derivative of S^-1/2 g and of the prior's
-residuals with respect to z, the inverse of J^T J equals the sandwich covariance of robust
-statistics: intervals are valid although the noise is neither white nor Gaussian nor known.
-
-Least squares and Kalman smoothers are unsuitable because the current is a noisy input: least
-squares underestimates R by the fraction of noise in the current's variance, and a smoother needs
-the spectra of three noises and the voltage between rows. Moments need none of these.
+A drop of the brushes and a resistance that falls with current explain similar logs, with different
+resistances. Both are fitted, and if the log does not tell them apart (Vuong 1989), the intervals of
+resistance and back-EMF contain those of both.
 """
 
 import fnmatch
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from slipid.infer.bench.moments import (
-    Equation,
-    cell_length,
-    celled,
-    correlation_cells,
-    equation,
-    grouped,
-    scatter,
-    start,
-    widened,
+from slipid.infer.bench.held_out import HeldOut, held_out
+from slipid.infer.bench.least_squares import least_squares
+from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot, noise
+from slipid.infer.bench.open_loop import (
+    SETTLED,
+    Channels,
+    OpenLoop,
+    OpenLoopFit,
+    fit_open_loop,
+    open_loop,
+    values_of,
+    with_speed_delay,
 )
-from slipid.infer.bench.motor import (
-    AMPS,
-    BRUSH_CURRENT,
-    REST,
-    VOLTS,
-    BenchMotor,
-    BenchRecord,
-    BenchRoot,
-    noise,
-)
-from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
+from slipid.infer.bench.rows import Between, Rows, excerpt, rows_of
+from slipid.infer.bench.uncertainty import Uncertainty, advantage, significance, uncertainty
+from slipid.infer.verdicts.estimates import Z95
 from slipid.search_space import Choice, Space
-from slipid.support.errors import DataError
 
-MOST_ROUNDS = 30
-"""Largest number of updates of weights, scatter and parameters."""
-SETTLED_STDS = 0.02
-"""Largest change of a parameter in the last round of a converged fit [std]."""
-TIME_CONSTANT_STD_S = 2e-3
-"""Prior std of the electrical time constant L_a / R [s]."""
-MOMENTS = (len(VOLTS) - 1, len(AMPS))
-"""Number of moments of the electrical and of the mechanical equation.
-
-The last signal of both equations is the sign given to unsigned currents; it multiplies residuals
-only in the mechanical equation."""
+FORMS: tuple[Between, ...] = ("held", "straight", "jumps")
+"""Forms of the voltage between rows that are tried."""
+WHOLE_DELAYS = (-1.0, 0.0, 1.0)
+"""Delays of a voltage that is held or straight between rows [row]."""
+DELAYS_OF_JUMPS = (-1.5, -0.8, -0.5, -0.2, 0.5)
+"""Delays of jumps between rows from which fits may start [row]."""
+DELAYS_OF_SPEED = (-1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
+"""Delays of a speed from which fits may start [row]."""
+JUMPS_COST = 0.05
+"""Log-likelihood per row that jumps between rows have to gain, since they fit noise, too."""
+SIGNIFICANT_STDS = 4.0
+"""Estimate of an effect above which it is added to the model [std]."""
+UNLIKELY_STDS, LIKELY_STDS = 2.0, 4.0
+"""Advantage of a falling resistance over a drop of the brushes below which it is not considered,
+and above which it alone is considered [std]."""
+DROP_SHARE = 0.01
+"""Voltage of the brushes over that of the winding below which both models agree."""
+LARGEST_DRIFT = 0.1
+"""Usual size of a drift of the resistance in a record [1]."""
+LARGEST_FALL = 0.5
+"""Largest relative fall of the resistance from which a fit starts."""
+SMALL_CURRENT = 0.1
+"""Smallest current of the range of a falling resistance, relative to the largest current."""
+LARGE_CURRENT = 0.75
+"""Current at which what a drop still rises may be resistance, relative to the largest current."""
+TIME_CONSTANT_S = 5e-4
+"""Usual electrical time constant L_a / R [s]."""
+USUAL_DROP_V, DROP_OF_SUPPLY = 0.3, 0.03
+"""Usual voltage drop of the brushes, and its largest share of the largest voltage [V], [1]."""
+DECIDING_ROWS = 3000
+"""Number of rows from which the form of the model is decided."""
+WARM_UP = 0.2
+"""Part of an excerpt, at its start, in which the simulation forgets its inexact start."""
+ROUGHLY_SETTLED = 0.5
+"""Decrease of the loss below which a fit that decides on a form, or to a part of the rows, ends."""
+FOLD_ROUNDS = 8
+"""Largest number of steps of a fit to a part of the rows."""
+_NOTHING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,327 +82,377 @@ class MotorFit:
     Attributes:
         label: label of the motor, "" for a single one.
         records: runs of the motor.
-        space: free and fixed parameters with their priors.
         choices: user's choices.
-        z: search vector at the optimum.
-        covariance: covariance of the search vector.
-        equations: the electrical equation, absent without voltage, and the mechanical one.
-        correlation_time: time over which residuals are correlated [s].
-        independent_times: length of the records divided by twice the correlation time.
-        converged: True if the parameters converged.
-        reason: sentence on how the fit ended.
-        rounds: number of rounds.
+        fit: fit of the selected model.
+        between: form of the voltage between rows.
+        uncertainty: uncertainty of the search vector.
+        ranges: intervals of parameters that more than one model explains, or that change in the
+            log, keyed by path [SI].
+        contested: True if a drop of the brushes and a falling resistance are not told apart.
+        held_out: errors on rows that were not used, None without voltages.
+        rounds: number of steps of all fits.
     """
 
     label: str
     records: tuple[BenchRecord, ...]
-    space: Space
     choices: tuple[Choice, ...]
-    z: Float[np.ndarray, " free"]
-    covariance: Float[np.ndarray, "free free"]
-    equations: tuple[Equation, ...]
-    correlation_time: float
-    independent_times: float
-    converged: bool
-    reason: str
+    fit: OpenLoopFit
+    between: Between
+    uncertainty: Uncertainty
+    ranges: Mapping[str, tuple[float, float]]
+    contested: bool
+    held_out: HeldOut | None
     rounds: int
+
+    @property
+    def rows(self) -> Rows:
+        return self.fit.rows
+
+    @property
+    def space(self) -> Space:
+        return self.fit.space
+
+    @property
+    def z(self) -> Float[np.ndarray, " free"]:
+        return self.fit.z
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "free free"]:
+        return self.uncertainty.covariance
 
     @property
     def motor(self) -> BenchMotor:
         """Motor with the fitted parameters."""
-        found: BenchMotor = self.space.tree(jnp.asarray(self.z)).motor
-        return found
+        return self.fit.at.motor
+
+    @property
+    def converged(self) -> bool:
+        return self.fit.converged and bool(np.isfinite(self.z).all())
+
+    @property
+    def reason(self) -> str:
+        """Sentence on how the fit ended."""
+        if self.converged:
+            return f"the likelihood did not increase any more after {self.rounds} steps"
+        return f"{self.rounds} steps without convergence"
 
     @property
     def noise(self) -> dict[str, float | None]:
         """Std of the white noise of each channel, None for a channel that was not logged."""
-        volts = [r.voltage for r in self.records if r.voltage is not None]
-        return {
-            "voltage": noise(volts) if volts else None,
-            "current": noise([r.amps for r in self.records]),
-            "speed": noise([r.speed for r in self.records]),
-        }
+        out: dict[str, float | None] = {}
+        for channel in ("voltage", "current", "speed"):
+            signals = [getattr(r, channel) for r in self.records]
+            out[channel] = None if signals[0] is None else noise(signals)
+        return out
 
     @property
     def has_voltage(self) -> bool:
-        return len(self.equations) > 1
+        return self.records[0].voltage is not None
+
+    @property
+    def has_current(self) -> bool:
+        return self.records[0].current is not None
 
     @property
     def period(self) -> float:
         """Median time between rows [s]."""
-        return float(np.median([r.period for r in self.records]))
-
-
-class _Objective(eqx.Module):
-    """Arguments of the search for the optimum.
-
-    Attributes:
-        space: free parameters with their priors.
-        root: S^-1/2, which whitens the moments.
-        constant: vector h of each equation (`Equation`), the mechanical equation last.
-        slope: matrix G of each equation.
-    """
-
-    space: Space
-    root: Array
-    constant: tuple[Array, ...]
-    slope: tuple[Array, ...]
+        return self.rows.period
 
 
 def fit_motor(
-    records: Sequence[BenchRecord], choices: Sequence[Choice] = (), label: str = ""
+    records: Sequence[BenchRecord],
+    choices: Sequence[Choice] = (),
+    label: str = "",
+    between: Between | None = None,
 ) -> MotorFit:
-    """Return the fit of one motor to its records, of which all or none have voltages."""
-    amps, volts = mechanical(records), electrical(records, 0.0)
-    first = _first(volts, amps, all(r.signed for r in records))
-    scaled = [*_scaled(records, float(first.resistance)), *choices]
-    space = Space(BenchRoot(BenchMotor()), scaled)
-    z = space.vector(BenchRoot(first))
-    # Start values from the user replace those estimated from the equations.
-    started = [c.pattern for c in choices if c.start is not None]
-    chosen = space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in started))
-    z = np.where(chosen, space.start, z)
-    zero, moved, rounds = 0.0, np.inf, 0
-    while moved >= SETTLED_STDS and rounds < MOST_ROUNDS:
-        motor = space.tree(jnp.asarray(z)).motor
-        if abs(float(motor.current_offset) - zero) > 0.02 * BRUSH_CURRENT:
-            zero = float(motor.current_offset)
-            volts = electrical(records, zero)
-        equations = [equation(amps, np.asarray(motor.amps()), MOMENTS[1])]
-        if volts is not None:
-            equations.insert(0, equation(volts, np.asarray(motor.volts()), MOMENTS[0]))
-        s, correlation_time, independent_times = _scatter(equations)
-        new, covariance = _solved(space, z, equations, s)
-        moved = float(np.max(np.abs(new - z) / np.sqrt(np.diag(covariance)), initial=0.0))
-        z, rounds = new, rounds + 1
-    settled = moved < SETTLED_STDS and bool(np.isfinite(z).all())
-    reason = f"no parameter changed by {100 * SETTLED_STDS:g} % of its std in round {rounds}"
+    """Return the fit of one motor to its records.
+
+    Args:
+        records: records, all with the same channels.
+        choices: user's choices.
+        label: label of the motor.
+        between: form of the voltage between rows, None for the likeliest.
+    """
+    some = excerpt(records, DECIDING_ROWS)
+    model = _BenchModel(rows_of(some, WARM_UP if len(some) > len(records) else 0.0), tuple(choices))
+    best, form = model.with_form(FORMS if between is None else (between,))
+    rows = rows_of(records).between(form)
+    best = model.fitted(rows, best.space, best.at.motor)
+    best = model.extended(best)
+    compared = [best]
+    if model.is_full and (other := model.with_falling_resistance(best)) is not None:
+        compared.append(other)
+    lead = advantage(compared[-1], compared[0]) if len(compared) > 1 else -np.inf
+    contested = -UNLIKELY_STDS <= lead <= LIKELY_STDS
+    if lead > LIKELY_STDS:
+        compared = compared[::-1]
+    chosen = compared[0]
+    known = uncertainty(chosen)
+    rivals = [(chosen, known)] + ([(compared[1], uncertainty(compared[1]))] if contested else [])
     return MotorFit(
         label=label,
         records=tuple(records),
-        space=space,
         choices=tuple(choices),
-        z=z,
-        covariance=covariance,
-        equations=tuple(equations),
-        correlation_time=correlation_time,
-        independent_times=independent_times,
-        converged=settled,
-        reason=reason if settled else f"{rounds} rounds without convergence",
-        rounds=rounds,
+        fit=chosen,
+        between=form,
+        uncertainty=known,
+        ranges=_ranges(rivals),
+        contested=contested,
+        held_out=_held_out(chosen) if records[0].voltage is not None else None,
+        rounds=model.rounds,
     )
 
 
-def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> BenchMotor:
-    """Estimate start values from each equation separately; defaults replace negative estimates."""
-    usual = BenchMotor()
-    r, c, drop, slow, one = float(usual.resistance), float(usual.back_emf), 0.0, 0.0, 0.0
-    if volts is not None:
-        found = start(volts, MOMENTS[0])
-        r, c = (float(x) if x > 0 else y for x, y in zip(found, (r, c), strict=False))
-        drop, slow, one = map(float, found[2:5])
-    # With unsigned currents, the zero of the ammeter and friction have the same signal: the zero is
-    # not estimated then.
-    k = start(amps, MOMENTS[1] if signed else MOMENTS[1] - 1)
-    torque = (usual.rotor_inertia, usual.coulomb_friction, usual.viscous_friction)
-    j, tau, b = (float(x) * c if x > 0 else float(y) for x, y in zip(k, torque, strict=False))
-    zero = float(k[3])
-    return BenchMotor(
-        # The order is that in which `BenchMotor` declares its parameters.
-        *map(jnp.asarray, (r, c, slow, drop, tau, b, j, zero, one + r * zero))
-    )
+class _BenchModel:
+    """The model of a motor, which grows with what its rows show.
 
-
-def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
-    """Return priors scaled to the motor.
-
-    The stds of the meters' zeros are a tenth of the largest signals, and that of the inductance is
-    `TIME_CONSTANT_STD_S` times the resistance.
+    Attributes:
+        rows: rows.
+        is_full: True if voltage and current were logged.
+        rounds: number of steps of all fits.
     """
-    amps = 0.1 * max(float(np.abs(r.amps).max()) for r in records)
-    chosen = [Choice("motor.current_offset", prior_mean=0.0, prior_std=max(amps, 1e-6))]
-    known = [r.voltage for r in records if r.voltage is not None]
-    if known:
-        volts = 0.1 * max(float(np.abs(u).max()) for u in known)
-        chosen.append(Choice("motor.voltage_offset", prior_mean=0.0, prior_std=max(volts, 1e-6)))
-    slow = TIME_CONSTANT_STD_S * resistance
-    return [*chosen, Choice("motor.inductance", prior_mean=0.0, prior_std=slow)]
 
+    def __init__(self, rows: Rows, choices: tuple[Choice, ...]):
+        self.rows, self.rounds = rows, 0
+        self._choices = choices
+        self.is_full = rows.has_current and bool(rows.inputs.driven)
+        used = rows.used
+        self._amps = max(float(np.abs(rows.current[used]).max()), 1e-9)
+        self._volts = max(float(np.abs(rows.voltage[used]).max()), 1e-9)
+        self._start = self._first()
 
-def _scatter(
-    equations: Sequence[Equation],
-) -> tuple[Float[np.ndarray, "moment moment"], float, float]:
-    """Return the covariance S of all moments, and the correlation time of residuals [s].
-
-    The third result is the number of independent times: the length of the records in units of twice
-    the correlation time.
-    """
-    length = cell_length([e.windows for e in equations])
-    parts = [celled(e.moments, e.windows, length) for e in equations]
-    count = max(len(p) for p in parts)
-    g = np.concatenate([np.pad(p, ((0, count - len(p)), (0, 0))) for p in parts], axis=1)
-    residuals = [celled(e.weighted_residual[:, None], e.windows, length)[:, 0] for e in equations]
-    lags = 2 * max(correlation_cells(x) for x in residuals) + 2
-    groups = np.concatenate([grouped(e) for e in equations], axis=1)
-    return widened(scatter(g, lags), groups), lags * length / 2, count / lags
-
-
-def _solved(
-    space: Space, z: np.ndarray, equations: Sequence[Equation], s: np.ndarray
-) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
-    """Return the optimum of the free parameters, and its covariance.
-
-    The weights of the equations and the covariance S of all moments, `s`, are held fixed.
-    """
-    std = np.sqrt(np.maximum(np.diag(s), 1e-300))
-    # S is singular for collinear signals, as in a log at one speed, hence the 1e-9
-    root = np.linalg.inv(np.linalg.cholesky(s / std / std[:, None] + 1e-9 * np.eye(len(s)))) / std
-    constant, slope, tangent = (
-        tuple(jnp.asarray(getattr(e, name)) for e in equations)
-        for name in ("constant", "slope", "tangent")
-    )
-    held = _Objective(space, jnp.asarray(root), constant, slope)
-    found, of_tangents = _searched(jnp.asarray(z), held, replace(held, slope=tangent))
-    jacobian = np.asarray(of_tangents)
-    return np.asarray(found), np.linalg.inv(jacobian.T @ jacobian)
-
-
-@eqx.filter_jit
-def _searched(
-    z: Float[Array, " free"], held: _Objective, tangents: _Objective
-) -> tuple[Array, Array]:
-    """Return the optimum of `held`, and the Jacobian there of the residuals of `tangents`."""
-    solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
-    found = optx.least_squares(_residuals, solver, z, args=held, max_steps=200, throw=False)
-    return found.value, jax.jacfwd(_residuals)(found.value, tangents)
-
-
-def _residuals(z: Float[Array, " free"], held: _Objective) -> Float[Array, " residual"]:
-    """Return S^-1/2 g and the residuals of the prior."""
-    motor = held.space.tree(z).motor
-    coefficients = (motor.volts(), motor.amps())[-len(held.slope) :]
-    sums_of = zip(held.constant, held.slope, coefficients, strict=True)
-    g = jnp.concatenate([constant - slope @ k for constant, slope, k in sums_of])
-    prior = (z - held.space.prior_mean) / held.space.prior_std
-    return jnp.concatenate([held.root @ g, prior])
-
-
-FEWEST_WINDOWS = 30
-"""Smallest number of windows of an equation for a fit."""
-SURE_STDS = 5.0
-"""A column is refused if a coefficient of wrong sign is larger than this in magnitude [std]."""
-FASTEST_SHAFT = 3000.0
-"""Shaft speed that brushed motors do not reach: a faster one shows a wrong unit [rad/s]."""
-LARGEST_POWER = 2e4
-"""Power U^2 / R at standstill above which the current is assumed to be in milliamperes [W]."""
-
-
-def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool = False) -> None:
-    """Raise `DataError`, with a remedy, if records contradict the meaning of their columns.
-
-    With `unit_known` the unit of the current is not checked.
-    """
-    where = records[0].name + (f", motor {label}" if label else "")
-    speed = np.concatenate([r.speed for r in records])
-    current = np.concatenate([r.amps for r in records])
-    if float(np.abs(speed).max()) > FASTEST_SHAFT:
-        _fail(
-            where,
-            f"the shaft turns at {np.abs(speed).max():.4g} rad/s",
-            "its correct unit, perhaps rpm",
-        )
-    if float(np.ptp(speed)) < max(6 * noise([r.speed for r in records]), REST):
-        found = f"the shaft does not turn (speeds within {np.ptp(speed):.3g} rad/s)"
-        _fail(
-            where, found, "a log in which the motor turns in both directions and at several speeds"
-        )
-    if np.ptp(current) == 0:
-        _fail(where, f"the current is {current[0]:g} A in every row", "the motor's current")
-    if all(r.signed for r in records):
-        _signed(where, speed, current)
-    amps, volts = mechanical(records), electrical(records, 0.0)
-    if amps.usable.sum() < FEWEST_WINDOWS:
-        found = f"the log has {amps.usable.sum()} short windows in which the shaft turns"
-        _fail(where, found, f"at least {FEWEST_WINDOWS}: a longer log, or more rows per second")
-    _signs(where, records, volts, amps)
-    if volts is not None and not unit_known:
-        _milliamperes(where, records, volts)
-
-
-def _fail(where: str, found: str, expected: str) -> None:
-    raise DataError(f"{where}: {found}; expected {expected}")
-
-
-def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
-    """Raise `DataError` if a current that is configured as signed consists of magnitudes."""
-    back = speed < -0.2 * float(np.abs(speed).max())
-    level = 0.1 * float(np.abs(current).max())
-    negative = (current < -level).mean()
-    driven = back.mean() > 0.05 and float(np.median(current[back])) > 0
-    if driven and negative == 0 and current.min() > -level:
-        found = "the current is never negative, though the shaft turns in both directions"
-        _fail(
-            where,
-            found,
-            "a signed current, or --unsigned (current_is_signed = false) for magnitudes",
+    def _first(self) -> BenchMotor:
+        """Return a motor from least squares, and with usual values of what they do not estimate."""
+        m = least_squares(self.rows, with_offset=True)
+        return eqx.tree_at(
+            lambda t: [t.inductance, t.brush_drop, t.brush_current, t.stribeck_friction],
+            m,
+            [
+                np.asarray(TIME_CONSTANT_S * float(m.resistance)),
+                np.asarray(self._usual_drop),
+                np.asarray(0.1 * self._amps),
+                np.asarray(0.1 * float(m.coulomb_friction)),
+            ],
         )
 
+    @property
+    def _usual_drop(self) -> float:
+        return min(USUAL_DROP_V, DROP_OF_SUPPLY * self._volts)
 
-def _signs(
-    where: str, records: Sequence[BenchRecord], volts: BenchWindows | None, amps: BenchWindows
-) -> None:
-    """Raise `DataError` for exchanged or reversed columns, shown by coefficients of wrong sign.
+    def space(self, more: Sequence[Choice] = ()) -> Space:
+        """Return the search space with priors scaled to the motor, and with choices."""
+        drop, row = self._usual_drop, self.rows.period
+        slow = TIME_CONSTANT_S * float(self._start.resistance)
+        dry = float(self._start.coulomb_friction)
+        usual = [
+            Choice("motor.current_offset", prior_mean=0.0, prior_std=0.1 * self._amps),
+            Choice("motor.voltage_offset", prior_mean=0.0, prior_std=0.03 * self._volts),
+            Choice("motor.inductance", prior_mean=slow, prior_std=2 * slow),
+            Choice("motor.brush_drop", prior_mean=drop, prior_std=1.2 * drop),
+            Choice("motor.brush_current", prior_mean=0.1 * self._amps, prior_std=0.1 * self._amps),
+            Choice("motor.fall_current", start=0.3 * self._amps),
+            Choice("motor.reference_current", start=self._typical_current),
+            Choice("motor.stribeck_friction", prior_mean=0.2 * dry, prior_std=0.3 * dry),
+            Choice("motor.voltage_delay", prior_mean=0.0, prior_std=row),
+            Choice("motor.speed_delay", prior_mean=0.0, prior_std=row),
+        ]
+        return Space(BenchRoot(BenchMotor()), [*usual, *self._reduced(), *more, *self._choices])
 
-    Current increases with acceleration because of inertia, and voltage with speed because of
-    back-EMF.
-    """
-    # Unsigned currents were given the sign of the speed, so their sign proves nothing.
-    inertia = _sure(amps, 0) if all(r.signed for r in records) else 0.0
-    if volts is None:
-        if inertia < -SURE_STDS:
-            found = "the shaft accelerates against its current"
-            _fail(
-                where,
-                found,
-                "current and speed with the same sign convention (reverse one of them: scale -1)",
+    @property
+    def _typical_current(self) -> float:
+        return float(np.sqrt(np.mean(self.rows.current[self.rows.used] ** 2))) or 1.0
+
+    def _reduced(self) -> list[Choice]:
+        """Return choices that fix what a missing channel leaves undetermined."""
+        if self.is_full:
+            return []
+        if self.rows.has_current:
+            return [Choice("motor.voltage_delay", fixed=0.0)]
+        fixed = {
+            "resistance": 1.0,
+            "inductance": _NOTHING,
+            "brush_drop": _NOTHING,
+            "stribeck_friction": _NOTHING,
+            "viscous_friction": 1e-12,
+            "current_offset": 0.0,
+            "speed_delay": 0.0,
+        }
+        unused = ("brush_current", "brush_shape", "brush_tail", "stribeck_speed")
+        return [
+            *(Choice(f"motor.{name}", fixed=value) for name, value in fixed.items()),
+            *(Choice(f"motor.{name}", free=False) for name in unused),
+        ]
+
+    def fitted(
+        self, rows: Rows, space: Space, start: BenchMotor, settled: float = SETTLED
+    ) -> OpenLoopFit:
+        """Return a fit that starts from a motor."""
+        found = fit_open_loop(rows, space, space.vector(BenchRoot(start)), settled=settled)
+        self.rounds += found.rounds
+        return found
+
+    def with_form(self, forms: Sequence[Between]) -> tuple[OpenLoopFit, Between]:
+        """Return the likeliest fit over forms of the voltage between rows, and its form.
+
+        Voltages that are held or straight arrive whole rows late, so that their delay is fixed;
+        that of jumps between rows is fitted, and has to pay for it.
+        """
+        space = self.space()
+        # Start values and priors from the user replace the estimated start values.
+        z = space.vector(BenchRoot(self._start))
+        started = [c.pattern for c in self._choices if (c.start, c.prior_mean) != (None, None)]
+        given = space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in started))
+        motor = space.tree(np.where(given, space.start, z)).motor
+        found: dict[Between, OpenLoopFit] = {}
+        for form in forms if self.rows.inputs.driven else forms[-1:]:
+            rows = self.rows.between(form)
+            for start in self._aligned(rows, form, motor):
+                space = self._with_delay(form, float(start.voltage_delay))
+                fit = self.fitted(rows, space, start, ROUGHLY_SETTLED)
+                if form not in found or fit.loss < found[form].loss:
+                    found[form] = fit
+        cost = {form: JUMPS_COST * rows.used.sum() if form == "jumps" else 0.0 for form in found}
+        best = min(found, key=lambda form: found[form].loss + cost[form])
+        return found[best], best
+
+    def _with_delay(self, form: Between, delay: float) -> Space:
+        """Return the search space for a form, whose delay [s] is fixed unless it has jumps."""
+        if form == "jumps" or not self.is_full:
+            return self.space()
+        return self.space([Choice("motor.voltage_delay", fixed=delay)])
+
+    def _aligned(self, rows: Rows, form: Between, motor: BenchMotor) -> list[BenchMotor]:
+        """Return motors from which to fit a form, with the likeliest delay of the speed.
+
+        Every whole delay of the voltage is tried, but only the likeliest one of jumps.
+        """
+        if not rows.inputs.driven:
+            return [motor]
+        found = []
+        for delay in DELAYS_OF_JUMPS if form == "jumps" else WHOLE_DELAYS:
+            at = open_loop(rows, values_of(_delayed(motor, delay, rows)), rows.start, passes=16)
+            late = DELAYS_OF_SPEED if rows.has_current else (0.0,)
+            moved = [with_speed_delay(rows, at, k * rows.period) for k in late]
+            found.append(min(moved, key=lambda m: _roughly(rows, m)))
+        if form == "jumps" or not self.is_full:
+            found = [min(found, key=lambda m: _roughly(rows, m))]
+        return [m.motor for m in found]
+
+    def extended(self, fit: OpenLoopFit) -> OpenLoopFit:
+        """Return the fit of the model with the effects that its rows show."""
+        if not self.is_full:
+            return fit
+        seconds = max(float(fit.rows.time.max()), 1e-9)
+        drift = significance(fit, "resistance_drift")
+        more = []
+        if abs(drift) > SIGNIFICANT_STDS:
+            wide = LARGEST_DRIFT / seconds
+            more.append(Choice("motor.resistance_drift", prior_mean=0.0, prior_std=wide))
+        if not more:
+            return fit
+        space = self.space([*_fixed_delay(fit), *more])
+        found = self.fitted(fit.rows, space, fit.at.motor)
+        return min(fit, found, key=lambda f: f.loss)
+
+    def with_falling_resistance(self, fit: OpenLoopFit) -> OpenLoopFit | None:
+        """Return a fit with a falling resistance in place of a drop of the brushes.
+
+        The result is None if the drop is negligible, or chosen by the user.
+        """
+        m = fit.at.motor
+        chosen = any(fnmatch.fnmatchcase("motor.brush_drop", c.pattern) for c in self._choices)
+        if chosen or float(m.brush_drop) < DROP_SHARE * float(m.resistance) * self._amps:
+            return None
+        drifts = "motor.resistance_drift" in fit.space.slices
+        wide = LARGEST_DRIFT / max(float(fit.rows.time.max()), 1e-9)
+        free = [Choice("motor.resistance_drift", prior_mean=0.0, prior_std=wide)] * drifts
+        space = self.space(
+            [
+                *_fixed_delay(fit),
+                *free,
+                Choice("motor.brush_drop", fixed=_NOTHING),
+                Choice("motor.brush_current", free=False),
+                Choice("motor.brush_shape", free=False),
+                Choice("motor.brush_tail", free=False),
+                Choice("motor.resistance_fall", free=True),
+                Choice("motor.fall_current", free=True),
+            ]
+        )
+        # The resistance at the typical current has the same voltage as with the drop.
+        resistance = float(m.resistance) + float(m.brush_drop) / self._typical_current
+        fall = min(float(m.brush_drop) / self._typical_current / resistance, LARGEST_FALL)
+        start = eqx.tree_at(
+            lambda t: [t.resistance, t.resistance_fall, t.brush_drop],
+            m,
+            [np.asarray(resistance), np.asarray(fall), np.asarray(_NOTHING)],
+        )
+        found = self.fitted(fit.rows, space, start)
+        return found if np.isfinite(found.loss) else None
+
+
+def _fixed_delay(fit: OpenLoopFit) -> list[Choice]:
+    """Return the choice that fixes the delay of the voltage where a fit has it fixed."""
+    if "motor.voltage_delay" in fit.space.slices:
+        return []
+    return [Choice("motor.voltage_delay", fixed=float(fit.at.motor.voltage_delay))]
+
+
+def _delayed(motor: BenchMotor, delay: float, rows: Rows) -> BenchMotor:
+    late = np.asarray(delay * rows.period)
+    moved: BenchMotor = eqx.tree_at(lambda m: m.voltage_delay, motor, late)
+    return moved
+
+
+def _roughly(rows: Rows, at: OpenLoop) -> float:
+    """Return the sum of logarithms of both channels' squared errors."""
+    errors = (np.stack([rows.current, rows.speed]) - at.readings)[:, rows.used]
+    squares = np.mean(errors**2, axis=1)
+    return float(np.log(np.maximum(squares, 1e-300))[0 if rows.has_current else 1 :].sum())
+
+
+def _ranges(
+    fits: Sequence[tuple[OpenLoopFit, Uncertainty]],
+) -> dict[str, tuple[float, float]]:
+    """Return the intervals of resistance and back-EMF over fits, and over the log's currents."""
+    out: dict[str, tuple[float, float]] = {}
+    for fit, known in fits:
+        std = np.sqrt(np.diag(known.covariance))
+        for path in ("motor.resistance", "motor.back_emf"):
+            if path not in fit.space.slices:
+                continue
+            at = fit.space.slices[path].start
+            value = float(np.exp(fit.z[at]))
+            low, high = (float(np.exp(fit.z[at] + k * std[at])) for k in (-Z95, Z95))
+            factors = (
+                _factors(fit) if path == "motor.resistance" and fit is fits[0][0] else (1.0, 1.0)
             )
-        return
-    along = sum(float(np.sum(r.voltage * r.speed)) for r in records if r.voltage is not None)
-    back, through = _sure(volts, 1), _sure(volts, 0)
-    if inertia < -SURE_STDS:
-        column = "current" if along > 0 else "speed"
-        found = f"the {column} has the wrong sign: the shaft accelerates against its current"
-        _fail(where, found, f"the {column} multiplied by -1")
-    if along < 0 and back < -SURE_STDS:
-        _fail(
-            where,
-            "the voltage has the wrong sign: it opposes the speed",
-            "the voltage multiplied by -1",
-        )
-    if back < -SURE_STDS and through > 0:
-        found = "the voltage falls with speed: voltage and current seem to be exchanged"
-        _fail(where, found, "each of them in the column of the other")
+            low, high = low * min(factors), high * max(factors)
+            before = out.get(path, (value, value))
+            out[path] = min(low, before[0]), max(high, before[1])
+    return out
 
 
-def _sure(w: BenchWindows, column: int) -> float:
-    """Return a coefficient divided by its std, estimated from one equation without priors."""
-    signals = w.signals.shape[-1] - (w.signals.shape[-1] == len(VOLTS))
-    found = start(w, signals)
-    s = equation(w, found, signals)
-    inverse = np.linalg.pinv(s.tangent[:, :signals], rcond=1e-10)
-    std = np.sqrt(np.diag(inverse @ scatter(s.moments, 8) @ inverse.T))
-    return float(found[column] / max(std[column], 1e-300))
+def _factors(fit: OpenLoopFit) -> tuple[float, float]:
+    """Return the smallest and the largest resistance in the log, relative to the fitted one.
+
+    A resistance that falls with current has a range, and so has a winding that warms. What a drop
+    of the brushes still rises at large currents may be resistance.
+    """
+    m, rows = fit.at.motor, fit.rows
+    amps = np.abs(fit.at.states[..., 0][rows.used])
+    largest = float(amps.max())
+    by_current = 1 + np.asarray(m.relative_fall(np.array([SMALL_CURRENT * largest, largest])))
+    _, slope = m.contact_voltage(np.asarray(LARGE_CURRENT * largest), np.asarray(0.0))
+    warm = float(m.resistance_drift) * rows.inputs.time[rows.used]
+    low = min(1.0, *by_current) * (1 + min(0.0, float(warm.min())))
+    high = max(1.0, *by_current) * (1 + max(0.0, float(warm.max())))
+    return float(low), float(high * (1 + float(slope) / float(m.resistance)))
 
 
-def _milliamperes(where: str, records: Sequence[BenchRecord], volts: BenchWindows) -> None:
-    found = start(volts, 5)
-    highest = max(float(np.abs(r.voltage).max()) for r in records if r.voltage is not None)
-    if 0 < found[0] < highest**2 / LARGEST_POWER and _sure(volts, 0) > SURE_STDS:
-        heat = highest**2 / found[0] / 1e3
-        _fail(
-            where,
-            f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, that is {heat:.0f} kW at "
-            "standstill",
-            "the unit of the current (I:mA for mA; if it is really A, I:A or a prior of "
-            "motor.resistance)",
-        )
+def _held_out(fit: OpenLoopFit) -> HeldOut:
+    def readings(use: np.ndarray) -> Channels:
+        weight = use.astype(float)
+        some = fit_open_loop(fit.rows, fit.space, fit.z, weight, FOLD_ROUNDS, ROUGHLY_SETTLED)
+        return some.at.readings
+
+    return held_out(fit.rows, readings)

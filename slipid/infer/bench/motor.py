@@ -1,42 +1,26 @@
-"""Model and records of a motor on a bench: its two equations for a short window of time.
+"""Model and records of a motor on a bench.
 
-With <x> for the mean and [x] for the mean slope of a signal over a window,
+    U - U_0 = R (1 + h t) I + C_e w + D(I) + L_a dI/dt
+    C_e I   = J dw/dt + b w + F(w)
 
-    <U> = R <I> + C_e <w> + U_b s(<I> - I_0) + L_a [I] + U_0 - R I_0      s(i) = tanh(i / 0.05 A)
-    <I> = (J [w] + tau_c tanh(<w> / w0) + b <w>) / C_e + I_0              w0 = 2.5 rad/s
-
-where speed, inertia and friction are those at the motor shaft, and the torque constant equals the
-back-EMF constant by conservation of energy. If the ammeter shows magnitudes, the zero I_0 is
-multiplied by the sign of the speed w.
-
-Both equations are linear in coefficients, which are functions of the motor's parameters. `VOLTS`
-and `AMPS` list the signals that these coefficients multiply.
+with the voltage D of the contacts and the dry friction F. Speed, inertia and friction are those at
+the motor shaft, and the torque constant equals the back-EMF constant by conservation of energy. The
+ammeter shows I + I_0, or |I| + I_0 if it shows magnitudes.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.parameter import parameter
-from slipid.support.errors import DataError
-
-BRUSH_CURRENT = 0.05
-"""Current over which the voltage drop of the brushes changes its sign, as in `model.motor` [A]."""
-REST = 2.5
-"""Shaft speed w0 over which friction changes its sign [rad/s]."""
-VOLTS = ("current", "speed", "sign of the current", "slope of the current", "one", "along")
-"""Signals of the electrical equation; `along` is the sign given to unsigned currents, 1 for signed
-ones."""
-AMPS = ("slope of the speed", "sign of the speed", "speed", "along")
-"""Signals of the mechanical equation; `along` as in `VOLTS`."""
+from slipid.parameter import Numbers, known, parameter
 
 
 class BenchMotor(eqx.Module):
-    """A brushed DC motor with its load and the zeros of both meters, with weak priors."""
+    """A brushed DC motor with its load, and zeros and delays of its meters, with weak priors."""
 
     resistance: Array = parameter(
         "ohm", "R", "winding resistance", start=1.0, lower=0.0, spread=2.0
@@ -44,10 +28,64 @@ class BenchMotor(eqx.Module):
     back_emf: Array = parameter(
         "V*s/rad", "C_e", "back-EMF, and torque per current", start=0.05, lower=0.0, spread=2.0
     )
-    inductance: Array = parameter("H", "L_a", "inductance", start=0.0, spread=2e-3)
-    brush_drop: Array = parameter("V", "U_b", "voltage drop of the brushes", start=0.0, spread=1.0)
+    inductance: Array = parameter(
+        "H", "L_a", "inductance", start=1e-3, lower=0.0, spread=2.0, closed=True
+    )
+    brush_drop: Array = parameter(
+        "V", "U_b", "voltage drop of the brushes", start=0.1, lower=0.0, spread=2.0, closed=True
+    )
+    brush_current: Array = parameter(
+        "A",
+        "I_b",
+        "current over which the brushes reach their drop",
+        start=0.1,
+        lower=0.0,
+        spread=1.5,
+    )
+    brush_shape: Array = parameter(
+        "1",
+        "kappa",
+        "shape of the brush drop over current, from exponential (0) to tanh (1)",
+        start=0.5,
+        lower=0.0,
+        upper=1.0,
+        spread=2.0,
+    )
+    brush_tail: Array = parameter(
+        "1",
+        "q",
+        "part of the brush drop that grows with the logarithm of the current",
+        start=0.1,
+        lower=0.0,
+        upper=1.0,
+        spread=1.5,
+    )
+    resistance_fall: Array = known(
+        "1", "k_R", "fall of the resistance from small to large currents", start=0.0, spread=0.3
+    )
+    fall_current: Array = known(
+        "A", "I_f", "current over which the resistance falls", start=1.0, lower=0.0, spread=1.0
+    )
+    reference_current: Array = known(
+        "A", "I_R", "current at which the resistance is given", start=1.0, lower=0.0
+    )
+    resistance_drift: Array = known(
+        "1/s", "h_R", "relative change of the resistance with time", start=0.0, spread=1e-2
+    )
     coulomb_friction: Array = parameter(
-        "N*m", "tau_c", "friction at the shaft", start=0.005, lower=0.0, spread=3.0
+        "N*m", "tau_c", "friction at the shaft", start=0.005, lower=0.0, spread=3.0, closed=True
+    )
+    stribeck_friction: Array = parameter(
+        "N*m",
+        "tau_s",
+        "friction at the shaft that ends at speed",
+        start=1e-3,
+        lower=0.0,
+        spread=1.5,
+        closed=True,
+    )
+    stribeck_speed: Array = parameter(
+        "rad/s", "w_s", "speed at which that friction ends", start=5.0, lower=0.0, spread=1.0
     )
     viscous_friction: Array = parameter(
         "N*m*s/rad", "b", "friction per shaft speed", start=1e-5, lower=0.0, spread=3.0
@@ -57,18 +95,65 @@ class BenchMotor(eqx.Module):
     )
     current_offset: Array = parameter("A", "I_0", "zero of the ammeter", start=0.0, spread=0.2)
     voltage_offset: Array = parameter("V", "U_0", "zero of the voltmeter", start=0.0, spread=1.0)
+    voltage_delay: Array = parameter(
+        "s", "T_u", "time from a logged voltage to its current", start=0.0, spread=0.02
+    )
+    speed_delay: Array = parameter(
+        "s", "T_w", "time from a logged current to its speed", start=0.0, spread=0.02
+    )
 
-    def volts(self) -> Float[Array, " 6"]:
-        """Return the coefficients of `VOLTS`."""
-        r, zero = self.resistance, -self.resistance * self.current_offset
-        return jnp.stack(
-            [r, self.back_emf, self.brush_drop, self.inductance, self.voltage_offset, zero]
+    def dry_friction(self, speed: Array) -> Array:
+        """Return the size of the dry friction at a shaft speed [N m]."""
+        return self.coulomb_friction + self.stribeck_friction * jnp.exp(
+            -((speed / self.stribeck_speed) ** 2)
         )
 
-    def amps(self) -> Float[Array, " 4"]:
-        """Return the coefficients of `AMPS`."""
-        torque = jnp.stack([self.rotor_inertia, self.coulomb_friction, self.viscous_friction])
-        return jnp.append(torque / self.back_emf, self.current_offset)
+    def contact_voltage(self, size: Numbers, resistance: Numbers) -> tuple[Array, Array]:
+        """Return the voltage D of the contacts at the size of a current, and its derivative.
+
+        D(I) = U_b [(1 - q) (1 - e) / (1 + kappa e) + q log(1 + I / I_b)] + R f(I) I with
+        e = exp(-I / I_b) and f = `relative_fall`.
+        """
+        e, ratio = jnp.exp(-size / self.brush_current), size / self.brush_current
+        kappa, tail = self.brush_shape, self.brush_tail
+        below, per = 1 + kappa * e, self.brush_drop / self.brush_current
+        rise = per * ((1 - tail) * e * (1 + kappa) / below**2 + tail / (1 + ratio))
+        fall = self.relative_fall(size)
+        bend = self.resistance_fall * jnp.exp(-size / self.fall_current) * size / self.fall_current
+        brushes = self.brush_drop * ((1 - tail) * (1 - e) / below + tail * jnp.log1p(ratio))
+        return brushes + resistance * fall * size, rise + resistance * (fall - bend)
+
+    def mean_contact_voltage(self, start: Array, end: Array, resistance: Array) -> Array:
+        """Return the mean of sign(I) D(|I|) for a current that changes at a constant rate.
+
+        It is the difference of the antiderivative of D over that of the currents.
+        """
+        apart = jnp.abs(end - start) > 1e-3 * self.brush_current
+        span = jnp.where(apart, end - start, 1.0)
+        rise = self._integral(end, resistance) - self._integral(start, resistance)
+        middle = (start + end) / 2
+        close = jnp.sign(middle) * self.contact_voltage(jnp.abs(middle), resistance)[0]
+        return jnp.where(apart, rise / span, close)
+
+    def _integral(self, current: Array, resistance: Array) -> Array:
+        """Return the integral of D from current 0 [V A], but for a constant."""
+        size, kappa, scale = jnp.abs(current), self.brush_shape, self.brush_current
+        quick = scale * (1 + kappa) / kappa * jnp.log1p(kappa * jnp.exp(-size / scale))
+        tail = self.brush_tail
+        slow = (scale + size) * jnp.log1p(size / scale) - size
+        brushes = (1 - tail) * (size + quick) + tail * slow
+        given = jnp.exp(-self.reference_current / self.fall_current)
+        fall = self.fall_current
+        film = -fall * (size + fall) * jnp.exp(-size / fall) - given * size**2 / 2
+        return self.brush_drop * brushes + resistance * self.resistance_fall * film
+
+    def relative_fall(self, size: Numbers) -> Array:
+        """Return the resistance at the size of a current, relative to the given one, minus 1.
+
+        It is k_R (exp(-I / I_f) - exp(-I_R / I_f)).
+        """
+        given = jnp.exp(-self.reference_current / self.fall_current)
+        return self.resistance_fall * (jnp.exp(-size / self.fall_current) - given)
 
 
 class BenchRoot(eqx.Module):
@@ -100,16 +185,19 @@ class BenchRecord:
     speed: Float[np.ndarray, " row"]
     signed: bool = True
 
-    @property
-    def amps(self) -> Float[np.ndarray, " row"]:
-        """Current [A]; raises `DataError` if it was not logged."""
-        if self.current is None:
-            raise DataError(
-                f"{self.name}: no column for the current: voltage and speed alone tell kS, kV and "
-                "kA (the voltages for friction, speed and acceleration), which slipid does not fit "
-                "yet; expected --current with the column of the motor's current"
-            )
-        return self.current
+    def mapped(self, of: Callable[[Float[np.ndarray, " row"]], np.ndarray]) -> "BenchRecord":
+        """Return the record with a function of the rows of each logged channel."""
+        return replace(
+            self,
+            time=of(self.time),
+            voltage=None if self.voltage is None else of(self.voltage),
+            current=None if self.current is None else of(self.current),
+            speed=of(self.speed),
+        )
+
+    def part(self, first: int, end: int) -> "BenchRecord":
+        """Return the rows from `first` to before `end`."""
+        return self.mapped(lambda x: x[first:end])
 
     @property
     def period(self) -> float:

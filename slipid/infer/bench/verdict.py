@@ -1,90 +1,95 @@
 """Verdicts on motors of a bench: parameters with intervals, misfits, and remedies.
 
-A misfit is a dependence of residuals on speed, current or time.
+A misfit is a dependence of residuals on speed, current or time. No parameter is better than weak if
+least squares simulate held-out rows better than the fitted motor.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from slipid.infer.bench.fit import MotorFit
-from slipid.infer.bench.moments import Equation, cell_length, celled
 from slipid.infer.fit_file import SCHEMA, number_json
-from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
+from slipid.infer.verdicts.estimates import FROM_ZERO, Z95, Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members, sentences
 from slipid.infer.verdicts.wording import VOLTAGE
 from slipid.support.content import Content
 from slipid.support.files import hash_of
 
 BINS = 8
-"""Number of bins over speed, current or time, with about equal numbers of windows."""
+"""Number of bins over speed, current or time, with about equal numbers of rows."""
 MISFIT_STDS = 5.0
 """Smallest mean residual of a bin that is reported as a misfit [std of the mean]."""
-MISFIT_SHARE = 0.01
+MISFIT_SHARE = 0.02
 """Smallest mean residual that is reported as a misfit, divided by the range of the channel."""
 FEWEST_CELLS = 5
 """Smallest number of cells of time in a bin from which the std of its mean is estimated."""
 LONG_CORRELATION_S = 0.3
 """Correlation time of residuals above which a message reports it [s]."""
+VAGUE = 0.1
+"""Std of resistance or back-EMF over all models that explain a log, relative to the estimate, above
+which the verdict is weak."""
+WIDER = 2.0
+"""Ratio of a std to that of chance above which a message reports what differs."""
 
 
 def misfits(fit: MotorFit) -> dict[str, str]:
-    """Return a sentence on the largest misfit of each equation, keyed by the equation's channel.
+    """Return a sentence on the largest misfit of each channel, keyed by the channel.
 
-    A misfit is the largest mean residual over bins of speed, current or time. Equations without a
+    A misfit is the largest mean residual over bins of speed, current or time. Channels without a
     significant and large misfit are omitted.
     """
-    return {e.channel: text for e in fit.equations if (text := _worst(fit, e)) is not None}
+    found = {}
+    for k, (channel, unit) in enumerate((("current", "A"), ("speed", "rad/s"))):
+        if (channel == "speed" or fit.rows.has_current) and (text := _worst(fit, k, channel, unit)):
+            found[channel] = text
+    return found
 
 
-def _worst(fit: MotorFit, equation: Equation) -> str | None:
-    """Return a sentence on the most significant misfit of an equation, None if it has none."""
-    w, sentence, largest = equation.windows, None, MISFIT_STDS
-    size = MISFIT_SHARE * float(np.ptp(w.measured.mean(axis=0)))
-    used = np.flatnonzero(w.usable)
-    for over, (even, odd), unit in (
-        ("speed", w.speed, "rad/s"),
-        ("current", w.current, "A"),
-        ("time", (w.time, w.time), "s"),
+def _worst(fit: MotorFit, k: int, channel: str, unit: str) -> str | None:
+    """Return a sentence on the most significant misfit of a channel, None if it has none."""
+    used = fit.rows.used
+    residual, weight = fit.fit.residuals[k][used], fit.fit.weights[k][used]
+    measured = (fit.rows.current, fit.rows.speed)[k][used]
+    size, largest, sentence = MISFIT_SHARE * float(np.ptp(measured)), MISFIT_STDS, None
+    current, speed = (fit.fit.at.states[..., j][used] for j in (0, 1))
+    for over, values, of in (
+        ("speed", speed, "rad/s"),
+        ("current", current, "A"),
+        ("time", fit.rows.time[used], "s"),
     ):
-        # A residual's own noise must not choose its bin: residuals of even rows are binned by odd
-        # rows, and vice versa.
-        bins = [np.array_split(used[np.argsort(v[used], kind="stable")], BINS) for v in (odd, even)]
-        for some in zip(*bins, strict=True):
-            off, sure = _mean(fit, equation, *some)
-            if abs(off) > size and sure > largest:
-                largest, at = sure, odd[some[0]]
+        for some in np.array_split(np.argsort(values, kind="stable"), BINS):
+            off, stds = _mean(fit, residual, weight, some)
+            if abs(off) > size and stds > largest:
+                largest, at = stds, values[some]
                 sentence = (
-                    f"the {equation.channel} is {abs(off):.2g} {equation.unit} "
+                    f"the {channel} is {abs(off):.2g} {unit} "
                     f"{'above' if off > 0 else 'below'} the model's at {at.min():.3g} to "
-                    f"{at.max():.3g} {unit} ({over}, {sure:.0f} stds): the motor has an effect "
+                    f"{at.max():.3g} {of} ({over}, {stds:.0f} stds): the motor has an effect "
                     "that the model does not include; the intervals are widened accordingly"
                 )
     return sentence
 
 
 def _mean(
-    fit: MotorFit, equation: Equation, even: Int[np.ndarray, " some"], odd: Int[np.ndarray, " some"]
+    fit: MotorFit,
+    residual: Float[np.ndarray, " row"],
+    weight: Float[np.ndarray, " row"],
+    some: Int[np.ndarray, " some"],
 ) -> tuple[float, float]:
-    """Return the weighted mean residual of some windows, and its size [std of the mean].
+    """Return the weighted mean residual of some rows, and its size [std of the mean].
 
-    `even` and `odd` are the windows whose residuals of even and of odd rows are averaged. Cells of
-    time as long as the residuals' correlation time count as independent.
+    Cells of time as long as the residuals' correlation time count as independent.
     """
-    w = equation.windows
-    weight, sum_ = np.zeros(len(w.time)), np.zeros(len(w.time))
-    for half, some in enumerate((even, odd)):
-        weight[some] += equation.weight[half, some]
-        sum_[some] += equation.weight[half, some] * equation.residual[half, some]
-    total = float(weight.sum())
+    total = float(weight[some].sum())
     if total <= 0:
         return 0.0, 0.0
-    off = float(sum_.sum()) / total
-    length = max(fit.correlation_time, cell_length([w]))
-    away = celled((sum_ - weight * off)[:, None], w, length)
-    square = away[:, 0] ** 2
+    off = float(weight[some] @ residual[some]) / total
+    cell = max(1, round(fit.uncertainty.correlation_time / fit.period))
+    sums = np.bincount(some // cell, weights=weight[some] * (residual[some] - off))
+    square = sums**2
     # A std estimated from few cells of time, or dominated by one cell, would not be reliable.
     if np.count_nonzero(square) < FEWEST_CELLS or square.max() > square.sum() / 2:
         return 0.0, 0.0
@@ -94,16 +99,16 @@ def _mean(
 ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
 """Smallest numbers of rows per time constant, L_a / R and J R / C_e^2, that identify L_a and J."""
 _NUMBERS_OF = {
-    "voltage": tuple(
-        f"motor.{name}"
-        for name in ("resistance", "back_emf", "brush_drop", "inductance", "voltage_offset")
-    ),
     "current": tuple(
         f"motor.{name}"
-        for name in ("coulomb_friction", "viscous_friction", "rotor_inertia", "current_offset")
+        for name in ("resistance", "brush_drop", "inductance", "current_offset", "coulomb_friction")
+    ),
+    "speed": tuple(
+        f"motor.{name}"
+        for name in ("back_emf", "rotor_inertia", "viscous_friction", "voltage_offset")
     ),
 }
-"""Paths of the parameters that the equation of each channel determines."""
+"""Paths of the parameters that a misfit of each channel concerns."""
 ONE_SPEED_RATIO = 0.05
 """Range of a log's speeds, divided by the largest speed, below which the log has only one operating
 point."""
@@ -152,8 +157,9 @@ class BenchFit:
 
     @property
     def good(self) -> bool:
-        """True if the fits converged and explain the logs."""
-        return self.converged and not any(self.misfits.values())
+        """True if the fits converged, explain the logs and predict held-out rows best."""
+        explained = not any(self.misfits.values()) and not any(map(_beaten, self.fits))
+        return self.converged and explained
 
     @property
     def reason(self) -> str:
@@ -173,6 +179,7 @@ class BenchFit:
             "surfaces": [],
             "curves": {},
             "validity": {},
+            **_held_out(self.fits),
             "motors": {
                 f.label or "motor": _about(f, list(self.misfits[f.label].values()))
                 for f in self.fits
@@ -190,18 +197,82 @@ def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
     found = {f.label: misfits(f) for f in fits}
     for f in fits:
         slow, voltage = _too_slow(f), f.has_voltage
-        directions = flat_directions(f.space, f.covariance, has_current=True, has_voltage=voltage)
+        directions = flat_directions(f.space, f.covariance, f.has_current, voltage)
         flat = [replace(one, remedy=_remedy(one.paths, voltage)) for one in directions]
         numbers = estimates(f.space, f.choices, f.z, f.covariance, voltage, members(flat))
         misfitted = {path for channel in found[f.label] for path in _NUMBERS_OF[channel]}
         quotients = derived(f.space, f.z, f.covariance, voltage)
-        for into, estimated in ((parameters, numbers), (ratios, quotients)):
-            for e in estimated:
-                path = "/".join(f"{p}@{f.label}" if f.label else p for p in e.path.split("/"))
-                into[path] = replace(_with_verdict(f, e, slow, misfitted), path=path)
+        judged = {
+            e.path: _with_verdict(f, _with_range(f, e), slow, misfitted)
+            for e in (*numbers, *quotients)
+        }
+        if not f.has_current:
+            judged = {e.path: e for e in voltage_gains(f, judged)}
+        for path, e in judged.items():
+            full = "/".join(f"{p}@{f.label}" if f.label else p for p in path.split("/"))
+            into = ratios if "/" in path else parameters
+            into[full] = replace(e, path=full)
         own = [*slow.values(), *sentences(flat), *found[f.label].values(), *_remarks(f)]
         messages += [f"{f.label}: {text}" if f.label else text for text in own]
     return BenchFit(tuple(fits), parameters, ratios, tuple(messages), found)
+
+
+def _with_range(f: MotorFit, e: Estimate) -> Estimate:
+    """Return an estimate with the interval of all models that explain the log, if there is one.
+
+    If the models differ much (`VAGUE`), the verdict is at most weak.
+    """
+    if e.path not in f.ranges or e.verdict == "fixed":
+        return e
+    low, high = f.ranges[e.path]
+    std = (high - low) / (2 * Z95)
+    weak = e.verdict == "identified" and std > VAGUE * e.value
+    return replace(e, interval90=(low, high), std=std, verdict="weak" if weak else e.verdict)
+
+
+_GAINS = {
+    "kS": ("V", "voltage against dry friction", ("motor.coulomb_friction", 1, -1)),
+    "kV": ("V*s/rad", "voltage per shaft speed", ("motor.back_emf", 0, 1)),
+    "kA": ("V*s^2/rad", "voltage per acceleration of the shaft", ("motor.rotor_inertia", 1, -1)),
+}
+"""Unit, meaning and numbers of the gains of a log without a current: tau_c / C_e, C_e and J / C_e.
+
+The resistance is 1 ohm there, so that torques over C_e are voltages."""
+
+
+def voltage_gains(f: MotorFit, judged: Mapping[str, Estimate]) -> list[Estimate]:
+    """Return kS, kV, kA and kG of a motor whose current was not logged.
+
+    `judged` are the estimates of the numbers from which the gains follow, keyed by path.
+    """
+    out, slices = [], f.space.slices
+    for name, (unit, doc, (path, power, emf)) in _GAINS.items():
+        direction = np.zeros(len(f.z))
+        if power:
+            direction[slices[path]] = power
+        direction[slices["motor.back_emf"]] += emf
+        std = float(np.sqrt(direction @ f.covariance @ direction))
+        value = float(np.exp(direction @ f.z))
+        ends = float(np.exp(-Z95 * std) * value), float(np.exp(min(Z95 * std, 300.0)) * value)
+        out.append(
+            Estimate(
+                path=f"motor.{name}",
+                unit=unit,
+                doc=doc,
+                value=value,
+                std=std * value,
+                interval90=ends,
+                verdict=judged[path].verdict,
+                provenance=judged[path].provenance,
+                ratio=judged[path].ratio,
+            )
+        )
+    lift = "voltage against gravity, or the zero of the voltmeter"
+    delay = "time from a logged voltage to its speed"
+    kept = (("voltage_offset", "kG", lift), ("voltage_delay", "voltage_delay", delay))
+    for number, name, doc in kept:
+        out.append(replace(judged[f"motor.{number}"], path=f"motor.{name}", doc=doc))
+    return out
 
 
 def _remedy(paths: Sequence[str], has_voltage: bool) -> str:
@@ -237,11 +308,14 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
 
 def _one_point(f: MotorFit) -> bool:
     """Return True if the speed is nearly constant (`ONE_SPEED_RATIO`)."""
-    amps = f.equations[-1].windows
-    used = amps.speed.mean(axis=0)[amps.usable]
-    return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_SPEED_RATIO * float(
-        np.abs(used).max()
-    )
+    speed = f.rows.speed[f.rows.used]
+    spread = float(np.ptp(np.quantile(speed, (0.02, 0.98))))
+    return spread < ONE_SPEED_RATIO * float(np.abs(speed).max())
+
+
+def _beaten(f: MotorFit) -> bool:
+    """Return True if least squares simulate held-out rows better."""
+    return f.held_out is not None and bool(f.held_out.worse_than)
 
 
 def _time(seconds: float) -> str:
@@ -253,15 +327,14 @@ def _with_verdict(
 ) -> Estimate:
     """Return an estimate with a weaker verdict if the logs do not support its present one.
 
-    Reasons are rows too far apart (`slow`), a single speed, an inductance near 0, and a misfit of
-    the parameter's equation (`misfitted`).
+    Reasons are rows too far apart (`slow`), a single speed, an inductance near 0, a misfit of the
+    parameter's channel (`misfitted`), and a rival that simulates held-out rows better.
     """
     if (e.path in slow or _one_point(f)) and e.verdict not in ("fixed", "not_identified"):
         return replace(e, verdict="not_identified", provenance="borrowed")
     small = e.path == "motor.inductance" and e.std is not None and e.value < FROM_ZERO * e.std
-    if e.verdict == "identified" and (small or {*e.path.split("/")} & {*misfitted}):
-        return replace(e, verdict="weak")
-    return e
+    doubtful = small or bool({*e.path.split("/")} & {*misfitted}) or _beaten(f)
+    return replace(e, verdict="weak") if doubtful and e.verdict == "identified" else e
 
 
 def _remarks(f: MotorFit) -> list[str]:
@@ -277,38 +350,77 @@ def _remarks(f: MotorFit) -> list[str]:
             "without a voltage neither resistance nor back-EMF is identified; friction and inertia "
             f"are identified only relative to the back-EMF; {VOLTAGE}"
         )
-    if not all(r.signed for r in f.records):
+    if not f.has_current:
         found.append(
-            "currents are magnitudes: they were given the sign of the speed, windows in which "
-            "the motor may brake were not used, and the zero of the ammeter cannot be "
-            "distinguished from friction"
+            "without a current the log determines kS, kV and kA, the voltages for friction, speed "
+            "and acceleration, but neither resistance nor back-EMF: log the motor current"
         )
+    elif not f.rows.signed:
+        found.append(
+            "currents are magnitudes: the zero of the ammeter cannot be distinguished from friction"
+        )
+    if f.held_out is not None and f.held_out.worse_than:
+        found.append(
+            "least squares simulate the held-out rows better than the fitted model, so that no "
+            "number is better than weak: the model lacks something that acts in this motor"
+        )
+    if f.contested:
+        found.append(
+            "a voltage drop of the brushes and a resistance that falls with current explain the "
+            "log about equally well: the interval of the resistance contains both"
+        )
+    found += _disagreements(f)
     if f.period > SLOW_ROWS_S:
         found.append(
             f"rows are {f.period:.3g} s apart: if the time is in milliseconds, set its unit (t:ms);"
             " inertia and inductance depend on it"
         )
-    if f.correlation_time > LONG_CORRELATION_S:
+    known = f.uncertainty
+    if known.correlation_time > LONG_CORRELATION_S:
         found.append(
-            f"residuals are correlated over {f.correlation_time:.2g} s: the intervals are "
-            f"computed from {f.independent_times:.0f} independent intervals of twice that time, "
-            "not from all rows"
+            f"residuals are correlated over {known.correlation_time:.2g} s: the intervals are "
+            f"computed from {known.independent_times:.0f} independent intervals of twice that "
+            "time, not from all rows"
         )
     if "motor.rotor_inertia" in f.space.slices:
-        found.append("motor.rotor_inertia includes everything that turned together with the rotor")
+        name = "motor.rotor_inertia" if f.has_current else "motor.kA"
+        found.append(f"{name} includes everything that turned together with the rotor")
     return found
+
+
+def _disagreements(f: MotorFit) -> list[str]:
+    """Return sentences on resistance and back-EMF that differ between preferences for rows."""
+    found = []
+    for path, symbol in (("motor.resistance", "R"), ("motor.back_emf", "C_e")):
+        if path not in f.space.slices:
+            continue
+        at = f.space.slices[path].start
+        wide = np.sqrt(f.covariance[at, at] / f.uncertainty.chance[at, at])
+        name, off = max(f.uncertainty.spread.items(), key=lambda item: abs(item[1][at]))
+        if wide > WIDER and abs(off[at]) > f.uncertainty.chance[at, at] ** 0.5:
+            value = float(np.exp(f.z[at]))
+            found.append(
+                f"{symbol} would be {value * float(np.exp(off[at])):.4g} instead of {value:.4g} if "
+                f"{name} counted more, which is more than chance: the interval is wider by that"
+            )
+    return found
+
+
+def _held_out(fits: Sequence[MotorFit]) -> Content:
+    """Return the errors on held-out rows, of the only motor or of each one by its label."""
+    known = {f.label: f.held_out.to_json() for f in fits if f.held_out is not None}
+    return {"held_out": known.get("", known)} if known else {}
 
 
 def _about(f: MotorFit, misfit: list[str]) -> Content:
     """Return the part of identified.json about the fit of one motor."""
-    windows = [e.windows for e in f.equations]
     return {
         "rounds": f.rounds,
         "reason": f.reason,
         "row_period_s": f.period,
         "noise": f.noise,
-        "memory_s": f.correlation_time,
-        "windows": [len(w.time) for w in windows],
-        "usable": [float(np.round(w.usable.mean(), 3)) for w in windows],
+        "memory_s": f.uncertainty.correlation_time,
+        "rows": int(f.rows.used.sum()),
+        "voltage_between_rows": f.between if f.has_voltage else None,
         "misfit": misfit,
     }

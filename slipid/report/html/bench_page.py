@@ -6,11 +6,11 @@ import numpy as np
 
 from slipid.exports.feedforward import gains_json
 from slipid.infer.bench.fit import MotorFit
-from slipid.infer.bench.moments import Equation
+from slipid.infer.bench.signals import FittedSignal, fitted_signals
 from slipid.infer.bench.verdict import BenchFit
-from slipid.infer.bench.windows import BenchWindows
 from slipid.infer.feedforward import bench_feedforwards
 from slipid.infer.verdicts.estimates import Estimate
+from slipid.report.held_out import WORDS, held_out_rows
 from slipid.report.html import figures as draw
 from slipid.report.html.blocks import (
     Badge,
@@ -55,6 +55,7 @@ def bench_page(fit: BenchFit, name: str, taken: Sequence[str] = ()) -> WebPage:
             _numbers(fit, name),
             _values(fit),
             *([] if gains is None else [gains]),
+            *_held_out(fit),
             *(_signals(f) for f in fit.fits),
             _origin(fit, taken),
         ],
@@ -115,83 +116,88 @@ def _row(e: Estimate) -> Sequence[Cell]:
     return e.path, shown, e.unit, ends, prior, badge(e.verdict), e.doc
 
 
+def _held_out(fit: BenchFit) -> list[PageSection]:
+    """Return the section about rows that were not used, if there are any."""
+    known = [(f.label or "motor", f.held_out) for f in fit.fits if f.held_out is not None]
+    if not known:
+        return []
+    rivals = tuple(WORDS.values())
+    rows = [
+        (name, row.channel, row.unit, row.error, *(row.rivals[word] for word in rivals))
+        for name, found in known
+        for row in held_out_rows(found)
+    ]
+    head = ("motor", "channel", "unit", "fitted motor", *rivals)
+    caption = (
+        "Root mean square errors of simulations from the voltage alone, on rows that were not used:"
+        " of the fitted motor, and of least squares for comparison."
+    )
+    table = TableBlock(caption, head, rows, head[3:])
+    return [PageSection("held_out", "Held-out rows", [table])]
+
+
 def _signals(fit: MotorFit) -> PageSection:
     """Return the section about measured and fitted signals of a motor, and their residuals."""
     which = f"_{fit.label}" if fit.label else ""
     title = f"Motor {fit.label}: signals" if fit.label else "Signals"
     blocks: list[Block] = []
-    for equation in fit.equations:
-        blocks.append(_overlay(equation, which))
-        blocks.append(_residuals(equation, which))
+    for signal in fitted_signals(fit):
+        blocks.append(_overlay(signal, which))
+        blocks.append(_residuals(signal, which))
     return PageSection(f"signals{which}", title, blocks)
 
 
-def _overlay(equation: Equation, which: str) -> FigureBlock:
-    """Return the figure of a measured and a fitted signal over time."""
-    w = equation.windows
-    measured = w.measured.mean(axis=0)
-    fitted = measured - equation.residual.mean(axis=0)
-    clock, some = _times(w), slice(None, None, max(1, len(w.time) // MOST_POINTS))
-    shown = [None if not ok else x for x, ok in zip(_short(fitted), w.usable.tolist(), strict=True)]
+def _overlay(signal: FittedSignal, which: str) -> FigureBlock:
+    """Return the figure of a measured and a simulated signal over time."""
+    some = slice(None, None, max(1, len(signal.time) // MOST_POINTS))
+    clock = _short(signal.time[some])
     wide = {"line": {"width": 5}, "opacity": 0.5}
+    thin = {"line": {"width": 1.5}}
     data = [
-        draw.line(_short(clock)[some], _short(measured)[some], "measured", "@muted", **wide),
-        draw.line(_short(clock)[some], shown[some], "fitted", "@blue", line={"width": 1.5}),
+        draw.line(clock, _short(signal.measured[some]), "measured", "@muted", **wide),
+        draw.line(clock, _short(signal.fitted[some]), "simulated", "@blue", **thin),
     ]
-    rms = float(np.sqrt(np.mean(equation.residual.mean(axis=0)[w.usable] ** 2)))
-    channel, unit = equation.channel, equation.unit
-    title = f"The {channel} is explained within {rms:.2g} {unit}"
+    rms = float(np.sqrt(np.mean(signal.residual**2)))
+    channel, unit = signal.channel, signal.unit
+    title = f"The {channel} is simulated within {rms:.2g} {unit}"
     layout = {
         "xaxis": draw.axis("time, records one after the other [s]"),
         "yaxis": draw.axis(f"{channel} [{unit}]"),
         "showlegend": True,
     }
-    alt = f"{title} (root mean square). Measured {channel} over time, and the one by the model."
-    caption = (
-        "The model computes it from the other measured signals, row by row; where the shaft "
-        "rests it predicts nothing."
-    )
+    alt = f"{title} (root mean square). Measured {channel} over time, and the simulated one."
+    caption = "The simulation knows the voltage alone, from the first row to the last."
     return FigureBlock(f"{channel}{which}", title, alt, data, layout, caption, 330)
 
 
-def _residuals(equation: Equation, which: str) -> FigureBlock:
+def _residuals(signal: FittedSignal, which: str) -> FigureBlock:
     """Return the figure of residuals over time, speed and current."""
-    w = equation.windows
-    residual = equation.residual.mean(axis=0)
-    used = np.flatnonzero(w.usable)
-    some = used[:: max(1, len(used) // MOST_POINTS)]
-    signals = (_times(w), w.speed.mean(axis=0), w.current.mean(axis=0))
+    residual = signal.residual
+    some = slice(None, None, max(1, len(residual) // MOST_POINTS))
+    signals = (signal.time, signal.speed, signal.current)
     names = ("time [s]", "speed [rad/s]", "current [A]")
     layout, axes, _ = draw.panels(3, names, 3)
     data = []
     for panel, x in zip(axes, signals, strict=True):
         dots = draw.dots(_short(x[some]), _short(residual[some]), "", "@muted", marker={"size": 3})
         data.append(draw.onto(dots, panel))
-        means = list(_binned(x, residual, used))
+        means = list(_binned(x, residual))
         line = draw.line([m[0] for m in means], [m[1] for m in means], "", "@orange")
         data.append(draw.onto(line | {"mode": "lines+markers"}, panel))
-        layout[f"yaxis{panel}"] |= {"range": [-6 * equation.scale, 6 * equation.scale]}
-    layout["yaxis"] |= draw.axis(f"residual [{equation.unit}]")
+        layout[f"yaxis{panel}"] |= {"range": [-6 * signal.scale, 6 * signal.scale]}
+    layout["yaxis"] |= draw.axis(f"residual [{signal.unit}]")
     layout["showlegend"] = False
-    title = f"Residuals of the {equation.channel}"
+    title = f"Residuals of the {signal.channel}"
     alt = f"{title} over time, speed and current, with their means in bins."
-    caption = "Measured less fitted; orange: means. A trend is an effect that the model lacks."
-    return FigureBlock(
-        f"residual_{equation.channel}{which}", title, alt, data, layout, caption, 260
-    )
+    caption = "Measured less simulated; orange: means. A trend is an effect that the model lacks."
+    return FigureBlock(f"residual_{signal.channel}{which}", title, alt, data, layout, caption, 260)
 
 
-def _binned(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> Iterator[tuple[float, float]]:
-    """Yield the median of x and the mean of y in bins of equal numbers of windows."""
-    for some in np.array_split(used[np.argsort(x[used], kind="stable")], 24):
+def _binned(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[float, float]]:
+    """Yield the median of x and the mean of y in bins of equal numbers of rows."""
+    for some in np.array_split(np.argsort(x, kind="stable"), 24):
         if len(some):
             yield float(np.median(x[some])), float(np.mean(y[some]))
-
-
-def _times(w: BenchWindows) -> np.ndarray:
-    """Return the times of windows, with records one after the other [s]."""
-    ends = [float(w.time[w.record == k].max(initial=0.0)) for k in range(int(w.record.max()) + 1)]
-    return np.asarray(w.time + np.concatenate([[0.0], np.cumsum(ends)])[w.record])
 
 
 def _short(x: np.ndarray) -> list[float]:

@@ -245,7 +245,7 @@ def test_kinds_come_in_the_stated_fractions():
 
 @pytest.fixture(scope="module")
 def benches():
-    return [made.bench(seed) for seed in range(24)]
+    return [made.bench(seed) for seed in range(10)]
 
 
 @pytest.mark.slow
@@ -313,8 +313,8 @@ def spread(experiment: made.Experiment) -> dict[str, float]:
 
 @pytest.mark.slow
 def test_resistance_and_back_emf_of_plain_motors_are_in_their_logs():
-    experiments = (made.drawn(np.random.default_rng(seed)) for seed in range(16))
+    experiments = (made.drawn(np.random.default_rng(seed)) for seed in range(6))
     plain = [experiment for experiment in experiments if experiment.kind.plain]
-    assert len(plain) > 3
+    assert len(plain) > 1
     for experiment in plain:
         assert max(spread(experiment).values()) < 0.02
