@@ -5,8 +5,8 @@ unless the user gives it. The model has a voltage drop of the brushes. A drift o
 with time is added only if its estimate is significant.
 
 A drop of the brushes and a resistance that falls with current explain similar logs, with different
-resistances. Both are fitted, and if the log does not tell them apart (Vuong 1989), the intervals of
-resistance and back-EMF contain those of both.
+resistances. Both are fitted, and if the log does not distinguish them (Vuong 1989), the intervals
+of resistance and back-EMF contain those of both. So do they for forms of the voltage between rows.
 """
 
 import fnmatch
@@ -34,6 +34,7 @@ from slipid.infer.bench.rows import Between, Rows, excerpt, rows_of
 from slipid.infer.bench.uncertainty import Uncertainty, advantage, significance, uncertainty
 from slipid.infer.verdicts.estimates import Z95
 from slipid.search_space import Choice, Space
+from slipid.support.errors import DataError
 
 FORMS: tuple[Between, ...] = ("held", "straight", "jumps")
 """Forms of the voltage between rows that are tried."""
@@ -43,8 +44,10 @@ DELAYS_OF_JUMPS = (-1.5, -0.8, -0.5, -0.2, 0.5)
 """Delays of jumps between rows from which fits may start [row]."""
 DELAYS_OF_SPEED = (-1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
 """Delays of a speed from which fits may start [row]."""
-JUMPS_COST = 0.05
-"""Log-likelihood per row that jumps between rows have to gain, since they fit noise, too."""
+JUMPS_COST = 15.0
+"""Log-likelihood that jumps between rows have to gain, since they fit noise, too."""
+SAME_NUMBERS = 0.002
+"""Relative difference below which resistances and back-EMFs of two forms are the same."""
 SIGNIFICANT_STDS = 4.0
 """Estimate of an effect above which it is added to the model [std]."""
 UNLIKELY_STDS, LIKELY_STDS = 2.0, 4.0
@@ -64,6 +67,8 @@ TIME_CONSTANT_S = 5e-4
 """Usual electrical time constant L_a / R [s]."""
 USUAL_DROP_V, DROP_OF_SUPPLY = 0.3, 0.03
 """Usual voltage drop of the brushes, and its largest share of the largest voltage [V], [1]."""
+LARGEST_OFFSET = 0.3
+"""Largest offset of the voltage from which a fit starts, relative to the largest voltage."""
 DECIDING_ROWS = 3000
 """Number of rows from which the form of the model is decided."""
 WARM_UP = 0.2
@@ -88,7 +93,8 @@ class MotorFit:
         uncertainty: uncertainty of the search vector.
         ranges: intervals of parameters that more than one model explains, or that change in the
             log, keyed by path [SI].
-        contested: True if a drop of the brushes and a falling resistance are not told apart.
+        contested: True if the log does not distinguish a drop of the brushes from a falling
+            resistance.
         held_out: errors on rows that were not used, None without voltages.
         rounds: number of steps of all fits.
     """
@@ -172,12 +178,20 @@ def fit_motor(
         choices: user's choices.
         label: label of the motor.
         between: form of the voltage between rows, None for the likeliest.
+
+    Raises:
+        DataError: no simulation of the motor is finite.
     """
     some = excerpt(records, DECIDING_ROWS)
     model = _BenchModel(rows_of(some, WARM_UP if len(some) > len(records) else 0.0), tuple(choices))
-    best, form = model.with_form(FORMS if between is None else (between,))
-    rows = rows_of(records).between(form)
-    best = model.fitted(rows, best.space, best.at.motor)
+    likeliest, *others = model.with_forms(FORMS if between is None else (between,))
+    rows = rows_of(records)
+    best = model.of_all(rows, likeliest)
+    if not np.isfinite(best.loss):
+        raise DataError(
+            f"{records[0].name}: no simulation of the motor follows this log; expected a log with "
+            "several speeds, or start values of resistance and back-EMF in a config"
+        )
     best = model.extended(best)
     compared = [best]
     if model.is_full and (other := model.with_falling_resistance(best)) is not None:
@@ -187,20 +201,47 @@ def fit_motor(
     if lead > LIKELY_STDS:
         compared = compared[::-1]
     chosen = compared[0]
-    known = uncertainty(chosen)
-    rivals = [(chosen, known)] + ([(compared[1], uncertainty(compared[1]))] if contested else [])
+    rivals = [*compared[: 1 + contested], *(model.of_all(rows, other) for other in others)]
+    known = [uncertainty(fit) for fit in rivals]
     return MotorFit(
         label=label,
         records=tuple(records),
         choices=tuple(choices),
         fit=chosen,
-        between=form,
-        uncertainty=known,
-        ranges=_ranges(rivals),
+        between=likeliest.form,
+        uncertainty=known[0],
+        ranges=_ranges(rivals, known),
         contested=contested,
         held_out=_held_out(chosen) if records[0].voltage is not None else None,
         rounds=model.rounds,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Formed:
+    """A fit with one form of the voltage between rows.
+
+    Attributes:
+        form: form.
+        fit: fit to the rows that decide on it.
+    """
+
+    form: Between
+    fit: OpenLoopFit
+
+    @property
+    def loss(self) -> float:
+        """Loss of the fit, and what jumps have to pay."""
+        return self.fit.loss + JUMPS_COST * (self.form == "jumps")
+
+    def rivals(self, best: "_Formed") -> bool:
+        """Return True if the likeliest form has other numbers, but is not clearly likelier."""
+        finite = np.isfinite(self.loss) and np.isfinite(best.loss)
+        if not finite or advantage(best.fit, self.fit) > UNLIKELY_STDS:
+            return False
+        mine, other = self.fit.at.motor, best.fit.at.motor
+        ratios = (mine.resistance / other.resistance, mine.back_emf / other.back_emf)
+        return max(abs(float(ratio) - 1) for ratio in ratios) > SAME_NUMBERS
 
 
 class _BenchModel:
@@ -224,10 +265,22 @@ class _BenchModel:
     def _first(self) -> BenchMotor:
         """Return a motor from least squares, and with usual values of what they do not estimate."""
         m = least_squares(self.rows, with_offset=True)
+        # At one speed, an offset cannot be distinguished from the voltage.
+        if abs(float(m.voltage_offset)) > LARGEST_OFFSET * self._volts:
+            m = least_squares(self.rows, with_offset=False)
+        # Rows do not show a motor that follows within a row.
+        least = self.rows.period * float(m.back_emf) ** 2 / float(m.resistance)
         return eqx.tree_at(
-            lambda t: [t.inductance, t.brush_drop, t.brush_current, t.stribeck_friction],
+            lambda t: [
+                t.rotor_inertia,
+                t.inductance,
+                t.brush_drop,
+                t.brush_current,
+                t.stribeck_friction,
+            ],
             m,
             [
+                np.asarray(max(float(m.rotor_inertia), least)),
                 np.asarray(TIME_CONSTANT_S * float(m.resistance)),
                 np.asarray(self._usual_drop),
                 np.asarray(0.1 * self._amps),
@@ -291,11 +344,12 @@ class _BenchModel:
         self.rounds += found.rounds
         return found
 
-    def with_form(self, forms: Sequence[Between]) -> tuple[OpenLoopFit, Between]:
-        """Return the likeliest fit over forms of the voltage between rows, and its form.
+    def with_forms(self, forms: Sequence[Between]) -> list["_Formed"]:
+        """Return fits with forms of the voltage between rows, of which the first is the likeliest.
 
-        Voltages that are held or straight arrive whole rows late, so that their delay is fixed;
-        that of jumps between rows is fitted, and has to pay for it.
+        The others are those that are not significantly less likely, but have another resistance or
+        back-EMF. Voltages that are held or straight arrive whole rows late, so that their delay is
+        fixed; that of jumps between rows is fitted, and has to pay for it.
         """
         space = self.space()
         # Start values and priors from the user replace the estimated start values.
@@ -303,23 +357,26 @@ class _BenchModel:
         started = [c.pattern for c in self._choices if (c.start, c.prior_mean) != (None, None)]
         given = space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in started))
         motor = space.tree(np.where(given, space.start, z)).motor
-        found: dict[Between, OpenLoopFit] = {}
+        found = []
         for form in forms if self.rows.inputs.driven else forms[-1:]:
             rows = self.rows.between(form)
-            for start in self._aligned(rows, form, motor):
-                space = self._with_delay(form, float(start.voltage_delay))
-                fit = self.fitted(rows, space, start, ROUGHLY_SETTLED)
-                if form not in found or fit.loss < found[form].loss:
-                    found[form] = fit
-        cost = {form: JUMPS_COST * rows.used.sum() if form == "jumps" else 0.0 for form in found}
-        best = min(found, key=lambda form: found[form].loss + cost[form])
-        return found[best], best
+            fits = [
+                self.fitted(rows, self._with_delay(form, start), start, ROUGHLY_SETTLED)
+                for start in self._aligned(rows, form, motor)
+            ]
+            found.append(_Formed(form, min(fits, key=lambda fit: fit.loss)))
+        best = min(found, key=lambda one: one.loss)
+        return [best, *(one for one in found if one is not best and one.rivals(best))]
 
-    def _with_delay(self, form: Between, delay: float) -> Space:
-        """Return the search space for a form, whose delay [s] is fixed unless it has jumps."""
+    def of_all(self, rows: Rows, one: "_Formed") -> OpenLoopFit:
+        """Return the fit with the form of another one, but to all rows."""
+        return self.fitted(rows.between(one.form), one.fit.space, one.fit.at.motor)
+
+    def _with_delay(self, form: Between, start: BenchMotor) -> Space:
+        """Return the search space for a form, with the delay of `start` unless it has jumps."""
         if form == "jumps" or not self.is_full:
             return self.space()
-        return self.space([Choice("motor.voltage_delay", fixed=delay)])
+        return self.space([Choice("motor.voltage_delay", fixed=float(start.voltage_delay))])
 
     def _aligned(self, rows: Rows, form: Between, motor: BenchMotor) -> list[BenchMotor]:
         """Return motors from which to fit a form, with the likeliest delay of the speed.
@@ -342,15 +399,9 @@ class _BenchModel:
         """Return the fit of the model with the effects that its rows show."""
         if not self.is_full:
             return fit
-        seconds = max(float(fit.rows.time.max()), 1e-9)
-        drift = significance(fit, "resistance_drift")
-        more = []
-        if abs(drift) > SIGNIFICANT_STDS:
-            wide = LARGEST_DRIFT / seconds
-            more.append(Choice("motor.resistance_drift", prior_mean=0.0, prior_std=wide))
-        if not more:
+        if abs(significance(fit, "resistance_drift")) < SIGNIFICANT_STDS:
             return fit
-        space = self.space([*_fixed_delay(fit), *more])
+        space = self.space([*_fixed_delay(fit), _drift(fit.rows)])
         found = self.fitted(fit.rows, space, fit.at.motor)
         return min(fit, found, key=lambda f: f.loss)
 
@@ -364,12 +415,10 @@ class _BenchModel:
         if chosen or float(m.brush_drop) < DROP_SHARE * float(m.resistance) * self._amps:
             return None
         drifts = "motor.resistance_drift" in fit.space.slices
-        wide = LARGEST_DRIFT / max(float(fit.rows.time.max()), 1e-9)
-        free = [Choice("motor.resistance_drift", prior_mean=0.0, prior_std=wide)] * drifts
         space = self.space(
             [
                 *_fixed_delay(fit),
-                *free,
+                *([_drift(fit.rows)] if drifts else []),
                 Choice("motor.brush_drop", fixed=_NOTHING),
                 Choice("motor.brush_current", free=False),
                 Choice("motor.brush_shape", free=False),
@@ -388,6 +437,12 @@ class _BenchModel:
         )
         found = self.fitted(fit.rows, space, start)
         return found if np.isfinite(found.loss) else None
+
+
+def _drift(rows: Rows) -> Choice:
+    """Return the choice that fits a drift of the resistance."""
+    seconds = max(float(rows.time.max()), 1e-9)
+    return Choice("motor.resistance_drift", prior_mean=0.0, prior_std=LARGEST_DRIFT / seconds)
 
 
 def _fixed_delay(fit: OpenLoopFit) -> list[Choice]:
@@ -411,25 +466,29 @@ def _roughly(rows: Rows, at: OpenLoop) -> float:
 
 
 def _ranges(
-    fits: Sequence[tuple[OpenLoopFit, Uncertainty]],
+    fits: Sequence[OpenLoopFit], known: Sequence[Uncertainty]
 ) -> dict[str, tuple[float, float]]:
-    """Return the intervals of resistance and back-EMF over fits, and over the log's currents."""
+    """Return the intervals of resistance and back-EMF over fits, and over the log's currents.
+
+    The first fit is the chosen one, whose resistance may change in the log.
+    """
     out: dict[str, tuple[float, float]] = {}
-    for fit, known in fits:
-        std = np.sqrt(np.diag(known.covariance))
-        for path in ("motor.resistance", "motor.back_emf"):
-            if path not in fit.space.slices:
-                continue
-            at = fit.space.slices[path].start
-            value = float(np.exp(fit.z[at]))
-            low, high = (float(np.exp(fit.z[at] + k * std[at])) for k in (-Z95, Z95))
-            factors = (
-                _factors(fit) if path == "motor.resistance" and fit is fits[0][0] else (1.0, 1.0)
-            )
-            low, high = low * min(factors), high * max(factors)
-            before = out.get(path, (value, value))
-            out[path] = min(low, before[0]), max(high, before[1])
+    for path in ("motor.resistance", "motor.back_emf"):
+        if path not in fits[0].space.slices:
+            continue
+        low, high = np.transpose([_interval(f, u, path) for f, u in zip(fits, known, strict=True)])
+        if path == "motor.resistance":
+            least, most = _factors(fits[0])
+            low[0], high[0] = least * low[0], most * high[0]
+        out[path] = float(low.min()), float(high.max())
     return out
+
+
+def _interval(fit: OpenLoopFit, known: Uncertainty, path: str) -> tuple[float, float]:
+    """Return the 90 % interval of a positive parameter."""
+    at = fit.space.slices[path].start
+    half = Z95 * float(np.sqrt(known.covariance[at, at]))
+    return float(np.exp(fit.z[at] - half)), float(np.exp(fit.z[at] + half))
 
 
 def _factors(fit: OpenLoopFit) -> tuple[float, float]:

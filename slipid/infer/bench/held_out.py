@@ -40,10 +40,10 @@ class Errors:
 
     def better(self, other: "Errors") -> bool:
         """Return True if a channel is simulated better than by `other`."""
-        amps = self.current is not None and other.current is not None
-        return self.speed < BETTER * other.speed or (
-            amps and self.current < BETTER * other.current  # type: ignore[operator]
-        )
+        pairs = [(self.speed, other.speed)]
+        if self.current is not None and other.current is not None:
+            pairs.append((self.current, other.current))
+        return any(mine < BETTER * theirs for mine, theirs in pairs)
 
 
 @dataclass(frozen=True)

@@ -177,7 +177,7 @@ class OpenLoopFit:
         by_values: those by all parameters [SI].
         scales: scale of each channel's residuals [A], [rad/s].
         weights: weight of each residual, in the normal equations of residuals over scales.
-        loss: negative log-posterior, without constants.
+        loss: negative log-posterior, without constants; infinite if it is not a number.
         converged: True if the parameters settled.
         rounds: number of steps.
     """
@@ -243,6 +243,8 @@ def fit_open_loop(
     residuals = _measured(rows) - search.at.readings
     squares = (residuals / search.scales[:, None, None]) ** 2
     constant = float(use.sum((1, 2)) @ np.log(search.scales))
+    loss = search.loss(search.at, search.z) + constant
+    ended = search.ended and bool(np.isfinite(loss))
     return OpenLoopFit(
         rows=rows,
         space=space,
@@ -252,8 +254,8 @@ def fit_open_loop(
         by_values=search.slopes.readings,
         scales=search.scales,
         weights=use * (DEGREES + 1) / (DEGREES + squares),
-        loss=search.loss(search.at, search.z) + constant,
-        converged=search.ended,
+        loss=loss if np.isfinite(loss) else np.inf,
+        converged=ended,
         rounds=search.rounds,
     )
 

@@ -272,14 +272,17 @@ def _friction(m: BenchMotor, w: Array, w_free: Array, at: _Steps) -> Array:
 def _through_contacts(m: BenchMotor, free: Array, at: _Steps) -> tuple[Array, Array]:
     """Return the current i with i = free - i_fast D(i), by Newton's method, and dD/di."""
     size, gain = jnp.abs(free), at.drop * at.i_fast
-    lowest = size / (1 + gain * m.brush_drop / m.brush_current)
+    # The slope of a concave drop is largest at rest, and so is a resistance that falls.
+    at_rest = jnp.maximum(m.relative_fall(jnp.zeros_like(size)), 0.0)
+    steepest = m.brush_drop / m.brush_current + at.resistance * at_rest
+    lowest = size / (1 + gain * steepest)
     z = jnp.maximum(size - gain * m.brush_drop, lowest) / (
         1 + gain * at.resistance * m.relative_fall(size)
     )
     slope = jnp.zeros_like(z)
     for _ in range(NEWTON_STEPS):
         voltage, slope = m.contact_voltage(z, at.resistance)
-        z = z - (z + gain * voltage - size) / (1 + gain * slope)
+        z = jnp.maximum(z - (z + gain * voltage - size) / (1 + gain * slope), lowest)
     return jnp.sign(free) * z, slope
 
 
