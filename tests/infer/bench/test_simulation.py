@@ -175,7 +175,7 @@ def test_drop_friction_and_warming_are_those_of_fine_steps(form, delay, kappa, t
 def test_voltage_slope_and_mean_of_the_contacts_agree():
     shape = {"brush_shape": 0.4, "brush_tail": 0.3, "resistance_fall": 0.5, "fall_current": 2.0}
     m, size = motor(**(FULL | shape)), np.linspace(0.01, 6.0, 40)
-    winding = np.asarray(1.5)
+    winding = jnp.asarray(1.5)
     _, slope = m.contact_voltage(size, winding)
     wanted = jax.vmap(jax.grad(lambda i: m.contact_voltage(i, winding)[0]))(size)
     np.testing.assert_allclose(slope, wanted, rtol=1e-9)
