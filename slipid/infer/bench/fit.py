@@ -95,6 +95,7 @@ class MotorFit:
             log, keyed by path [SI].
         contested: True if the log does not distinguish a drop of the brushes from a falling
             resistance.
+        other_forms: forms of the voltage between rows that are about as likely, with other numbers.
         held_out: errors on rows that were not used, None without voltages.
         rounds: number of steps of all fits.
     """
@@ -107,6 +108,7 @@ class MotorFit:
     uncertainty: Uncertainty
     ranges: Mapping[str, tuple[float, float]]
     contested: bool
+    other_forms: tuple[Between, ...]
     held_out: HeldOut | None
     rounds: int
 
@@ -212,6 +214,7 @@ def fit_motor(
         uncertainty=known[0],
         ranges=_ranges(rivals, known),
         contested=contested,
+        other_forms=tuple(other.form for other in others),
         held_out=_held_out(chosen) if records[0].voltage is not None else None,
         rounds=model.rounds,
     )

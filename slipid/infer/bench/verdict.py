@@ -122,7 +122,7 @@ _REMEDIES = (
     (("motor.rotor_inertia",), "accelerate and decelerate within some tenths of a second"),
     (
         ("motor.current_offset", "motor.coulomb_friction"),
-        "turn in both directions: otherwise the zero of the ammeter cannot be told from friction",
+        "turn in both directions: otherwise the zero of the ammeter cannot be distinguished from friction",
     ),
     (("motor.coulomb_friction", "motor.viscous_friction"), "turn steadily at several speeds"),
     (("motor.resistance",), "use larger currents: load the shaft, or accelerate it harder"),
@@ -368,6 +368,13 @@ def _remarks(f: MotorFit) -> list[str]:
         found.append(
             "a voltage drop of the brushes and a resistance that falls with current explain the "
             "log about equally well: the interval of the resistance contains both"
+        )
+    if f.other_forms:
+        others = " or ".join(f.other_forms)
+        found.append(
+            f"the voltage between rows is {f.between} or {others}, which the log does not "
+            "distinguish: the intervals of resistance and back-EMF contain both; give --between "
+            "(voltage_between_rows in a config) if you know it"
         )
     found += _disagreements(f)
     if f.period > SLOW_ROWS_S:

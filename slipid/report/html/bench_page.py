@@ -141,14 +141,15 @@ def _signals(fit: MotorFit) -> PageSection:
     which = f"_{fit.label}" if fit.label else ""
     title = f"Motor {fit.label}: signals" if fit.label else "Signals"
     blocks: list[Block] = []
+    given = "voltage" if fit.has_voltage else "current"
     for signal in fitted_signals(fit):
-        blocks.append(_overlay(signal, which))
+        blocks.append(_overlay(signal, which, given))
         blocks.append(_residuals(signal, which))
     return PageSection(f"signals{which}", title, blocks)
 
 
-def _overlay(signal: FittedSignal, which: str) -> FigureBlock:
-    """Return the figure of a measured and a simulated signal over time."""
+def _overlay(signal: FittedSignal, which: str, given: str) -> FigureBlock:
+    """Return the figure of a measured signal over time, and of that simulated from `given`."""
     some = slice(None, None, max(1, len(signal.time) // MOST_POINTS))
     clock = _short(signal.time[some])
     wide = {"line": {"width": 5}, "opacity": 0.5}
@@ -166,7 +167,7 @@ def _overlay(signal: FittedSignal, which: str) -> FigureBlock:
         "showlegend": True,
     }
     alt = f"{title} (root mean square). Measured {channel} over time, and the simulated one."
-    caption = "The simulation knows the voltage alone, from the first row to the last."
+    caption = f"The simulation uses the {given} alone, from the first row to the last."
     return FigureBlock(f"{channel}{which}", title, alt, data, layout, caption, 330)
 
 

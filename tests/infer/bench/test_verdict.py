@@ -1,4 +1,4 @@
-"""Verdicts on fitted motors: held-out rows, rivals, misfits, and models that a log cannot tell."""
+"""Verdicts on fitted motors: held-out rows, rivals, misfits, and models that a log does not distinguish."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_a_fixed_number_stays(record, drop):
     assert found["motor.resistance"].value == pytest.approx(5.5, rel=0.02)
 
 
-# models that a log does not tell -----------------------------------------------------------------
+# models that a log does not distinguish ----------------------------------------------------------
 
 NO_DROP = (Choice("motor.brush_drop", fixed=1e-9),)
 FALLING = (
@@ -160,7 +160,7 @@ FALLING = (
 
 
 @pytest.mark.slow
-def test_a_drop_and_a_falling_resistance_that_are_not_told_apart_widen_the_interval():
+def test_a_drop_and_a_falling_resistance_that_are_not_distinguished_widen_the_interval():
     """The brushes reach their drop over such large currents that the resistance might fall."""
     rows = made.driven(made.FLYWHEEL, drop=0.6, turn=1.0, profile=made.held)
     record = made.logged(rows, made.RATE, 1, noise=(0.05, 0.3, 3.0), at_changes=True)
@@ -180,7 +180,7 @@ def test_a_drop_and_a_falling_resistance_that_are_not_told_apart_widen_the_inter
 
 
 @pytest.mark.slow
-def test_a_steep_drop_is_told_from_a_falling_resistance():
+def test_a_steep_drop_is_distinguished_from_a_falling_resistance():
     rows = made.driven(made.FLYWHEEL, drop=0.6, profile=made.held)
     fit = fit_motor([made.logged(rows, made.RATE, 1, at_changes=True)], between="held")
     assert not fit.contested
@@ -195,3 +195,9 @@ def test_a_resistance_that_models_do_not_agree_on_is_weak(fit):
     found = bench_fit([wide]).parameters[path]
     assert found.interval90 == (low, 1.6 * high)
     assert found.verdict == "weak"
+
+
+def test_forms_of_the_voltage_that_are_about_as_likely_are_named(fit):
+    assert not any("--between" in text for text in bench_fit([fit]).messages)
+    found = bench_fit([replace(fit, other_forms=("straight",))])
+    assert any("is held or straight" in text and "--between" in text for text in found.messages)
