@@ -122,7 +122,7 @@ _REMEDIES = (
     (("motor.rotor_inertia",), "accelerate and decelerate within some tenths of a second"),
     (
         ("motor.current_offset", "motor.coulomb_friction"),
-        "turn in both directions: otherwise the zero of the ammeter cannot be distinguished from friction",
+        "turn in both directions: otherwise the zero of the ammeter looks like friction",
     ),
     (("motor.coulomb_friction", "motor.viscous_friction"), "turn steadily at several speeds"),
     (("motor.resistance",), "use larger currents: load the shaft, or accelerate it harder"),

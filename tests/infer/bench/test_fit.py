@@ -199,6 +199,19 @@ def test_a_wrong_form_of_the_voltage_is_less_likely(held, held_fit):
 
 
 @pytest.mark.slow
+def test_a_log_that_hides_the_form_of_its_voltage_has_the_numbers_of_every_likely_one():
+    """Steps between rows, of which there are few: the likeliest form has too small a resistance."""
+    fit = fit_motor([made.logged(made.driven(made.FLYWHEEL), 100, seed=1)])
+    assert fit.other_forms
+    low, high = fit.ranges["motor.resistance"]
+    true = made.truth(made.FLYWHEEL)["motor.resistance"]
+    assert low < true < high < 1.02 * true
+    at = fit.space.slices["motor.resistance"].start
+    alone = np.exp(fit.z[at] + 1.65 * np.sqrt(fit.covariance[at, at]))
+    assert high > alone
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("late", "rows"),
     [

@@ -1,4 +1,4 @@
-"""Verdicts on fitted motors: held-out rows, rivals, misfits, and models that a log does not distinguish."""
+"""Verdicts on fitted motors: held-out rows, rivals, misfits, and models that are as likely."""
 
 from __future__ import annotations
 
