@@ -7,6 +7,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 PLAIN_LOOPS = "--xla_cpu_use_fusion_emitters=false"
+MEASURED_JAXLIB = "0.10."
+"""Versions of jaxlib with which flags and options of XLA were measured."""
 
 
 def plain_loops() -> None:
@@ -20,8 +22,19 @@ def plain_loops() -> None:
     """
     flags = os.environ.get("XLA_FLAGS", "").strip()
     more = "fusion_emitters" not in flags and (not flags or flags.startswith("-"))
-    if more and version("jaxlib").startswith("0.10."):
+    if more and version("jaxlib").startswith(MEASURED_JAXLIB):
         os.environ["XLA_FLAGS"] = f"{flags} {PLAIN_LOOPS}".strip()
+
+
+def unfused() -> dict[str, str | bool] | None:
+    """Return options of `jax.jit` for a long program without loops, None for other jaxlibs.
+
+    XLA's fusion repeats operations in one another, eight times in the derivatives of a motor, whose
+    compilation then takes four times as long, and each call twice.
+    """
+    if not version("jaxlib").startswith(MEASURED_JAXLIB):
+        return None
+    return {"xla_disable_hlo_passes": "fusion", "xla_cpu_use_fusion_emitters": True}
 
 
 def one_blas_thread() -> None:

@@ -6,7 +6,9 @@ with time is added only if its estimate is significant.
 
 A drop of the brushes and a resistance that falls with current explain similar logs, with different
 resistances. Both are fitted, and if the log does not distinguish them (Vuong 1989), the intervals
-of resistance and back-EMF contain those of both. So do they for forms of the voltage between rows.
+of resistance and back-EMF are those of a mixture of both. So are they for forms of the voltage
+between rows. The weight of a fit is the probability that it is more likely than the chosen one,
+which itself has weight 1; weights of this kind are called pseudo-BMA+ (Yao et al. 2018).
 """
 
 import fnmatch
@@ -16,6 +18,7 @@ from dataclasses import dataclass
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtr
 
 from slipid.infer.bench.held_out import HeldOut, held_out
 from slipid.infer.bench.least_squares import least_squares
@@ -31,8 +34,13 @@ from slipid.infer.bench.open_loop import (
     with_speed_delay,
 )
 from slipid.infer.bench.rows import Between, Rows, excerpt, rows_of
-from slipid.infer.bench.uncertainty import Uncertainty, advantage, significance, uncertainty
-from slipid.infer.verdicts.estimates import Z95
+from slipid.infer.bench.uncertainty import (
+    Uncertainty,
+    advantage,
+    mixture_quantiles,
+    significance,
+    uncertainty,
+)
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 
@@ -203,8 +211,12 @@ def fit_motor(
     if lead > LIKELY_STDS:
         compared = compared[::-1]
     chosen = compared[0]
-    rivals = [*compared[: 1 + contested], *(model.of_all(rows, other) for other in others)]
+    # All rows may exclude a form that few rows do not.
+    formed = [_Formed(other.form, model.of_all(rows, other)) for other in others]
+    formed = [other for other in formed if other.is_likely_beside(chosen)]
+    rivals = [*compared[: 1 + contested], *(other.fit for other in formed)]
     known = [uncertainty(fit) for fit in rivals]
+    weights = [1.0, *(float(ndtr(advantage(fit, chosen))) for fit in rivals[1:])]
     return MotorFit(
         label=label,
         records=tuple(records),
@@ -212,9 +224,9 @@ def fit_motor(
         fit=chosen,
         between=likeliest.form,
         uncertainty=known[0],
-        ranges=_ranges(rivals, known),
+        ranges=_ranges(rivals, known, weights),
         contested=contested,
-        other_forms=tuple(other.form for other in others),
+        other_forms=tuple(other.form for other in formed),
         held_out=_held_out(chosen) if records[0].voltage is not None else None,
         rounds=model.rounds,
     )
@@ -226,7 +238,7 @@ class _Formed:
 
     Attributes:
         form: form.
-        fit: fit to the rows that decide on it.
+        fit: fit.
     """
 
     form: Between
@@ -237,12 +249,16 @@ class _Formed:
         """Loss of the fit, and what jumps have to pay."""
         return self.fit.loss + JUMPS_COST * (self.form == "jumps")
 
-    def rivals(self, best: "_Formed") -> bool:
-        """Return True if the likeliest form has other numbers, but is not clearly likelier."""
-        finite = np.isfinite(self.loss) and np.isfinite(best.loss)
-        if not finite or advantage(best.fit, self.fit) > UNLIKELY_STDS:
+    def is_likely_beside(self, best: OpenLoopFit) -> bool:
+        """Return True if another fit is not significantly more likely."""
+        finite = np.isfinite(self.fit.loss) and np.isfinite(best.loss)
+        return bool(finite) and advantage(best, self.fit) <= UNLIKELY_STDS
+
+    def rivals(self, best: OpenLoopFit) -> bool:
+        """Return True if the likeliest fit has other numbers, but is not clearly likelier."""
+        if not self.is_likely_beside(best):
             return False
-        mine, other = self.fit.at.motor, best.fit.at.motor
+        mine, other = self.fit.at.motor, best.at.motor
         ratios = (mine.resistance / other.resistance, mine.back_emf / other.back_emf)
         return max(abs(float(ratio) - 1) for ratio in ratios) > SAME_NUMBERS
 
@@ -369,7 +385,7 @@ class _BenchModel:
             ]
             found.append(_Formed(form, min(fits, key=lambda fit: fit.loss)))
         best = min(found, key=lambda one: one.loss)
-        return [best, *(one for one in found if one is not best and one.rivals(best))]
+        return [best, *(one for one in found if one is not best and one.rivals(best.fit))]
 
     def of_all(self, rows: Rows, one: "_Formed") -> OpenLoopFit:
         """Return the fit with the form of another one, but to all rows."""
@@ -469,29 +485,26 @@ def _roughly(rows: Rows, at: OpenLoop) -> float:
 
 
 def _ranges(
-    fits: Sequence[OpenLoopFit], known: Sequence[Uncertainty]
+    fits: Sequence[OpenLoopFit], known: Sequence[Uncertainty], weights: Sequence[float]
 ) -> dict[str, tuple[float, float]]:
     """Return the intervals of resistance and back-EMF over fits, and over the log's currents.
 
-    The first fit is the chosen one, whose resistance may change in the log.
+    The fits are mixed by their weights. The first one is the chosen one, whose resistance may
+    change in the log.
     """
     out: dict[str, tuple[float, float]] = {}
     for path in ("motor.resistance", "motor.back_emf"):
         if path not in fits[0].space.slices:
             continue
-        low, high = np.transpose([_interval(f, u, path) for f, u in zip(fits, known, strict=True)])
+        at = [fit.space.slices[path].start for fit in fits]
+        centres = np.array([fit.z[k] for fit, k in zip(fits, at, strict=True)])
+        stds = np.array([np.sqrt(u.covariance[k, k]) for u, k in zip(known, at, strict=True)])
+        low, high = np.exp(mixture_quantiles(centres, stds, np.array(weights)))
         if path == "motor.resistance":
             least, most = _factors(fits[0])
-            low[0], high[0] = least * low[0], most * high[0]
-        out[path] = float(low.min()), float(high.max())
+            low, high = least * low, most * high
+        out[path] = float(low), float(high)
     return out
-
-
-def _interval(fit: OpenLoopFit, known: Uncertainty, path: str) -> tuple[float, float]:
-    """Return the 90 % interval of a positive parameter."""
-    at = fit.space.slices[path].start
-    half = Z95 * float(np.sqrt(known.covariance[at, at]))
-    return float(np.exp(fit.z[at] - half)), float(np.exp(fit.z[at] + half))
 
 
 def _factors(fit: OpenLoopFit) -> tuple[float, float]:

@@ -14,6 +14,7 @@ Records are cut into segments, which are simulated side by side from given state
 """
 
 from dataclasses import fields
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ from jaxtyping import Array, Float
 
 from slipid.infer.bench.motor import BenchMotor
 from slipid.parameter import Numbers
+from slipid.support.jax_setup import unfused
 
 CONTEXT = 3
 """Number of rows beyond both ends of a segment that a delay of the voltage may reach."""
@@ -177,7 +179,7 @@ def _states(
     return jnp.stack(states, axis=-1).swapaxes(0, 1)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=unfused())
 def _of_steps(
     values: Float[Array, " parameter"],
     columns: Float[Array, "column row"],

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.special import ndtr
 
 from slipid.infer.bench.open_loop import DEGREES, OpenLoopFit, RowWeights
 
@@ -125,6 +126,18 @@ def advantage(one: OpenLoopFit, other: OpenLoopFit) -> float:
     lags = 2 * _correlation(gain[:, 0]) + 2
     variance = _scatter(gain - gain.mean(axis=0), lags)[0, 0]
     return float(gain.sum() / np.sqrt(max(variance, 1e-300)))
+
+
+def mixture_quantiles(
+    centres: Float[np.ndarray, " fit"],
+    stds: Float[np.ndarray, " fit"],
+    weights: Float[np.ndarray, " fit"],
+) -> Float[np.ndarray, "2"]:
+    """Return the 5 and 95 % quantiles of a weighted mixture of normal distributions."""
+    ends = centres + np.outer([-6.0, 6.0], stds)
+    x = np.linspace(ends.min(), ends.max(), 4001)
+    below = ndtr((x[:, None] - centres) / stds) @ (weights / weights.sum())
+    return np.interp([0.05, 0.95], below, x)
 
 
 class _Scores:

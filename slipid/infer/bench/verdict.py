@@ -367,14 +367,14 @@ def _remarks(f: MotorFit) -> list[str]:
     if f.contested:
         found.append(
             "a voltage drop of the brushes and a resistance that falls with current explain the "
-            "log about equally well: the interval of the resistance contains both"
+            "log about equally well: the interval of the resistance is that of both"
         )
     if f.other_forms:
         others = " or ".join(f.other_forms)
         found.append(
             f"the voltage between rows is {f.between} or {others}, which the log does not "
-            "distinguish: the intervals of resistance and back-EMF contain both; give --between "
-            "(voltage_between_rows in a config) if you know it"
+            "distinguish: the intervals of resistance and back-EMF are those of all of them; give "
+            "--between (voltage_between_rows in a config) if you know it"
         )
     found += _disagreements(f)
     if f.period > SLOW_ROWS_S:

@@ -11,6 +11,7 @@ from slipid.infer.bench.fit import MotorFit, fit_motor
 from slipid.infer.bench.motor import BenchRecord, noise
 from slipid.infer.bench.rows import Between
 from slipid.infer.bench.signals import fitted_signals
+from slipid.infer.bench.uncertainty import mixture_quantiles
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.infer.verdicts.estimates import Estimate
 from tests.helpers import made_bench as made
@@ -336,3 +337,14 @@ def test_at_one_speed_nothing_is_identified(record):
     found = fitted(still)
     assert {e.verdict for e in found.parameters.values()} <= {"fixed", "not_identified"}
     assert any("speed and voltage are constant" in text for text in found.messages)
+
+
+def test_an_interval_of_a_mixture_leaves_out_a_twentieth_of_it_on_either_side():
+    centres, stds = np.array([0.0, 10.0]), np.array([1.0, 2.0])
+    one = mixture_quantiles(centres[:1], stds[:1], np.ones(1))
+    assert one == pytest.approx([-1.6449, 1.6449], abs=1e-3)
+    ignored = mixture_quantiles(centres, stds, np.array([1.0, 0.0]))
+    assert ignored == pytest.approx(one, abs=1e-3)
+    # Far apart, each of both has a tenth of its own outside: 1.2816 standard deviations.
+    both = mixture_quantiles(centres, stds, np.ones(2))
+    assert both == pytest.approx([-1.2816, 10 + 2 * 1.2816], abs=1e-3)
