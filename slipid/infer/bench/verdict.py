@@ -31,6 +31,10 @@ LONG_CORRELATION_S = 0.3
 VAGUE = 0.1
 """Std of resistance or back-EMF over all models that explain a log, relative to the estimate, above
 which the verdict is weak."""
+LONGEST_TIME_CONSTANT_S = 5e-3
+"""Electrical time constant L_a / R above which what the current determines is at most weak [s].
+
+Those of small motors are shorter, and an ammeter's low-pass filter has almost the same effect."""
 WIDER = 2.0
 """Ratio of a std to that of chance above which a message reports what differs."""
 
@@ -200,7 +204,10 @@ def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
         directions = flat_directions(f.space, f.covariance, f.has_current, voltage)
         flat = [replace(one, remedy=_remedy(one.paths, voltage)) for one in directions]
         numbers = estimates(f.space, f.choices, f.z, f.covariance, voltage, members(flat))
-        misfitted = {path for channel in found[f.label] for path in _NUMBERS_OF[channel]}
+        filtered = {"current"} if _slow_current(f) is not None else set()
+        misfitted = {
+            path for channel in {*found[f.label], *filtered} for path in _NUMBERS_OF[channel]
+        }
         quotients = derived(f.space, f.z, f.covariance, voltage)
         judged = {
             e.path: _with_verdict(f, _with_range(f, e), slow, misfitted)
@@ -306,6 +313,14 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
     return slow
 
 
+def _slow_current(f: MotorFit) -> float | None:
+    """Return the electrical time constant if it is longer than usual [s], else None."""
+    constant = float(f.motor.inductance / f.motor.resistance)
+    return (
+        constant if f.has_voltage and f.has_current and constant > LONGEST_TIME_CONSTANT_S else None
+    )
+
+
 def _one_point(f: MotorFit) -> bool:
     """Return True if the speed is nearly constant (`ONE_SPEED_RATIO`)."""
     speed = f.rows.speed[f.rows.used]
@@ -377,6 +392,12 @@ def _remarks(f: MotorFit) -> list[str]:
             "--between (voltage_between_rows in a config) if you know it"
         )
     found += _disagreements(f)
+    if (constant := _slow_current(f)) is not None:
+        found.append(
+            f"the time constant L_a / R is {_time(constant)}, longer than those of usual motors: a "
+            "low-pass filter of the ammeter looks almost the same, but changes the resistance; log "
+            "the unfiltered current"
+        )
     if f.period > SLOW_ROWS_S:
         found.append(
             f"rows are {f.period:.3g} s apart: if the time is in milliseconds, set its unit (t:ms);"

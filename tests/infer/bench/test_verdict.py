@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from slipid.infer.bench.fit import MotorFit, fit_motor
 from slipid.infer.bench.held_out import Errors, HeldOut, folds, held_out
@@ -201,3 +202,17 @@ def test_forms_of_the_voltage_that_are_about_as_likely_are_named(fit):
     assert not any("--between" in text for text in bench_fit([fit]).messages)
     found = bench_fit([replace(fit, other_forms=("straight",))])
     assert any("is held or straight" in text and "--between" in text for text in found.messages)
+
+
+@pytest.mark.slow
+def test_a_filter_of_the_ammeter_makes_no_identified_resistance(fit, record):
+    """A filter of 10 ms, with which the resistance is off by more than its interval."""
+    share = 1 - np.exp(-record.period / 0.01)
+    filtered = lfilter([share], [1, share - 1], record.current)
+    found = bench_fit([fit_motor([replace(record, current=filtered)], between="held")])
+    text = "low-pass filter of the ammeter"
+    assert not any(text in message for message in bench_fit([fit]).messages)
+    assert any(text in message for message in found.messages)
+    resistance = found.parameters["motor.resistance"]
+    assert resistance.interval90[0] > made.TRUTH["resistance"]
+    assert resistance.verdict == "weak"
