@@ -142,7 +142,9 @@ def test_halves(motor: PublicMotor) -> None:
     if not motor.path.is_dir():
         pytest.skip(f"no {motor.path}; SLIPID_MOTOR_LOGS names the folder with the public logs")
     first, pieces = halves(motor.records())
-    table: list[list[Cell]] = []
+    inductance = None if motor.inductance is None else shown(motor.inductance / MILLI)
+    otherwise: list[Cell] = [motor.resistance, "", motor.back_emf, "", inductance]
+    table: list[list[Cell]] = [[motor.name, "measured otherwise", *otherwise, None, None, ""]]
     for f in fitted(motor, first):
         off = off_by(f.resistance, motor.resistance), off_by(f.back_emf, motor.back_emf)
         errs = [shown(e) for e in errors(f.simulate, pieces)]

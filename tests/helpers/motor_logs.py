@@ -46,6 +46,7 @@ class PublicMotor:
         read: reader of a log.
         resistance: resistance that was measured otherwise [ohm].
         back_emf: back-EMF constant that was measured otherwise [V s/rad].
+        inductance: inductance of the data sheet, None if it is not known [H].
     """
 
     name: str
@@ -54,6 +55,7 @@ class PublicMotor:
     read: Callable[[Path], BenchRecord]
     resistance: float
     back_emf: float
+    inductance: float | None
 
     @property
     def path(self) -> Path:
@@ -123,6 +125,7 @@ MOTORS = (
         padova_2021,
         3.1,
         7.68e-3,
+        0.18e-3,
     ),
     PublicMotor(
         "Faulhaber 2338S, Padova 2023",
@@ -131,7 +134,8 @@ MOTORS = (
         padova_2023,
         3.1,
         7.68e-3,
+        0.18e-3,
     ),
-    PublicMotor("QUBE-Servo 3, 1 V", "qube-3", ("data3_1v",), qube, 8.65, 0.0422),
+    PublicMotor("QUBE-Servo 3, 1 V", "qube-3", ("data3_1v",), qube, 8.65, 0.0422, None),
 )
 """Motors with public logs. But for the resistance of the last one, numbers are of data sheets."""
