@@ -12,6 +12,7 @@ voltage alone in runs of at most `PIECE` rows. CasADi (3.8.2) is not a dependenc
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -35,8 +36,8 @@ PIECE = 10_000
 """Largest number of rows of a simulation that is judged."""
 SHOWN = {"least_squares": "least squares", "least_squares_with_offset": "same with offsets"}
 """Names in the table of slipid's own rivals."""
-SOLVERS = {"scipy": by_scipy, "CasADi": by_casadi}
-"""Names in the table of other fits of a linear motor with dry friction."""
+SOLVERS = {"scipy": by_scipy, **({"CasADi": by_casadi} if find_spec("casadi") else {})}
+"""Names in the table of other fits of a linear motor with dry friction; CasADi if installed."""
 
 Simulation = Callable[[BenchRecord], np.ndarray]
 """Function from a record to its simulated current and speed."""
