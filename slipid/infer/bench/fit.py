@@ -194,9 +194,12 @@ def fit_motor(
     """
     some = excerpt(records, DECIDING_ROWS)
     model = _BenchModel(rows_of(some, WARM_UP if len(some) > len(records) else 0.0), tuple(choices))
-    likeliest, *others = model.with_forms(FORMS if between is None else (between,))
     rows = rows_of(records)
-    best = model.of_all(rows, likeliest)
+    some_forms = model.with_forms(FORMS if between is None else (between,))
+    # All rows may decide between forms that few rows do not.
+    formed = [_Formed(one.form, model.of_all(rows, one)) for one in some_forms]
+    likeliest = min(formed, key=lambda one: one.loss)
+    best = likeliest.fit
     if not np.isfinite(best.loss):
         raise DataError(
             f"{records[0].name}: no simulation of the motor follows this log; expected a log with "
@@ -211,10 +214,8 @@ def fit_motor(
     if lead > LIKELY_STDS:
         compared = compared[::-1]
     chosen = compared[0]
-    # All rows may exclude a form that few rows do not.
-    formed = [_Formed(other.form, model.of_all(rows, other)) for other in others]
-    formed = [other for other in formed if other.is_likely_beside(chosen)]
-    rivals = [*compared[: 1 + contested], *(other.fit for other in formed)]
+    others = [one for one in formed if one is not likeliest and one.is_likely_beside(chosen)]
+    rivals = [*compared[: 1 + contested], *(other.fit for other in others)]
     known = [uncertainty(fit) for fit in rivals]
     weights = [1.0, *(float(ndtr(advantage(fit, chosen))) for fit in rivals[1:])]
     return MotorFit(
@@ -226,7 +227,7 @@ def fit_motor(
         uncertainty=known[0],
         ranges=_ranges(rivals, known, weights),
         contested=contested,
-        other_forms=tuple(other.form for other in formed),
+        other_forms=tuple(other.form for other in others),
         held_out=_held_out(chosen) if records[0].voltage is not None else None,
         rounds=model.rounds,
     )
