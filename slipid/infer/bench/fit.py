@@ -17,7 +17,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from slipid.infer.bench.held_out import HeldOut, held_out
+from slipid.infer.bench.held_out import held_out
 from slipid.infer.bench.least_squares import least_squares
 from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot, noise
 from slipid.infer.bench.open_loop import (
