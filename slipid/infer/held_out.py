@@ -1,7 +1,9 @@
 """Errors of fitted motors on held-out rows, beside those of rivals."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
+from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE, Estimate
 from slipid.support.content import Content
 
 BETTER = 0.98
@@ -60,3 +62,14 @@ class HeldOut:
         """Return the errors whose `to_json` was stored."""
         rivals = {name: Errors.of_json(e) for name, e in content["rivals"].items()}
         return cls(Errors.of_json(content), rivals)
+
+
+def doubted(found: Mapping[str, Estimate], held_out: HeldOut | None) -> dict[str, Estimate]:
+    """Return estimates; those of R, C_e and R / C_e are at most weak if a rival predicts better."""
+    if held_out is None or not held_out.worse_than:
+        return dict(found)
+    weak = {*NEEDS_VOLTAGE, "/".join(NEEDS_VOLTAGE)}
+    return {
+        path: replace(e, verdict="weak") if path in weak and e.verdict == "identified" else e
+        for path, e in found.items()
+    }

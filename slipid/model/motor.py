@@ -21,7 +21,7 @@ It is about the resolution of the speed signal."""
 FRICTION_SPEED = 0.2
 """Wheel speed over which friction changes its sign [rad/s]."""
 
-NEWTON_STEPS = 6
+NEWTON_STEPS = 8
 """Number of Newton steps from a voltage to its current.
 
 The equation is concave and the start too small, so that the steps approach the solution from one

@@ -35,7 +35,6 @@ class HeldOutRow:
 
 def held_out_rows(found: "HeldOut") -> Iterator[HeldOutRow]:
     """Yield the errors of each channel that was logged."""
-
     own, rivals = found.errors, found.rivals
     yield from _row("speed", "rad/s", own.speed, {name: e.speed for name, e in rivals.items()})
     yield from _row("current", "A", own.current, {name: e.current for name, e in rivals.items()})

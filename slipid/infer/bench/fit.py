@@ -32,6 +32,7 @@ from slipid.infer.bench.open_loop import (
 )
 from slipid.infer.bench.rows import Between, Rows, excerpt, rows_of
 from slipid.infer.bench.uncertainty import Uncertainty, advantage, significance, uncertainty
+from slipid.infer.held_out import HeldOut
 from slipid.infer.verdicts.estimates import Z95
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
