@@ -1,10 +1,15 @@
 """Priors of the parameters of a robot's motor, from a fit of that motor on a test bench."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from slipid.app.config import Config
+from slipid.infer.verdicts.estimates import Z95
+from slipid.model.motor import Motor
+from slipid.parameter import Declaration, entries
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
 from slipid.support.files import read_json
@@ -14,19 +19,31 @@ COPY_NAME = "motor_bench.json"
 """Name of the copy of the bench file in the folder of a robot's results."""
 GEAR_STD = 0.3
 """Std of the change of friction by the robot's gear, relative to the friction on the bench [1]."""
-NAMES = ("resistance", "back_emf", "brush_drop", "coulomb_friction", "viscous_friction")
+NAMES = (
+    *("resistance", "back_emf", "brush_drop", "brush_current", "brush_shape", "brush_tail"),
+    *("coulomb_friction", "viscous_friction"),
+)
 """Names of the parameters taken from a bench. Sensor offsets are not taken, since they belong to
 the meters of the bench."""
+KNOWN = ("identified", "weak")
+"""Verdicts with which a parameter is taken from a bench."""
 _EXPECTED = "the identified.json that `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
-Identified = dict[str, list[tuple[float, float]]]
-"""Value and std of a parameter for each motor in which it is identified, keyed by the parameter's
-name."""
+Intervals = dict[str, list[tuple[float, float]]]
+"""90 % intervals of a parameter for each motor whose bench determines it, by the parameter's name.
+"""
 
 
-def bench_of(config: Config) -> tuple[Path, Identified] | None:
-    """Return the bench file that a config names and its estimates, or None if it names none.
+class _Prior(NamedTuple):
+    """Mean and std of a prior [unit of the parameter]."""
+
+    mean: float
+    std: float
+
+
+def bench_of(config: Config) -> tuple[Path, Intervals] | None:
+    """Return the bench file that a config names and its intervals, or None if it names none.
 
     Raises:
         DataError: the file is missing, damaged, or not the result of a bench.
@@ -54,32 +71,47 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
     if bench is None:
         return [], []
     path, known = bench
+    declared = {e.path: e.declaration for e in entries(Motor())}
     choices = []
     for name in (name for name in NAMES if name in known):
         power = {"coulomb_friction": 1, "viscous_friction": 2}.get(name, 0)
-        mean, std = _pooled(known[name])
-        if power and gear_ratio > 1:
-            std = float(np.hypot(std, GEAR_STD * mean))
+        wider = GEAR_STD if power and gear_ratio > 1 else 0.0
+        prior = _prior(declared[name], known[name], wider)
         times = gear_ratio**power
-        choices.append(Choice(f"motor.{name}", prior_mean=times * mean, prior_std=times * std))
+        choices.append(
+            Choice(f"motor.{name}", prior_mean=times * prior.mean, prior_std=times * prior.std)
+        )
     lines = [f"motor from {path}: {', '.join(c.pattern for c in choices) or 'nothing'}"]
     if left_out := [name for name in NAMES if name not in known]:
         lines.append(f"not taken from {path}, since not identified there: {', '.join(left_out)}")
     return choices, lines
 
 
-def _pooled(known: list[tuple[float, float]]) -> tuple[float, float]:
-    """Return the mean of the estimates of several motors, and the std of a single motor's value.
+def _prior(d: Declaration, intervals: list[tuple[float, float]], wider: float) -> _Prior:
+    """Return the prior of a single motor of which several were measured.
 
-    The std combines the std of the estimates with their spread between motors.
+    Each interval counts as that of a normal distribution of the logarithm, or of the log-odds for a
+    parameter with two bounds. The std combines the width of the intervals with the spread of their
+    centres. So it contains all that an interval does, such as the models that a log does not
+    distinguish, or the range of a resistance that changes with current.
+
+    Args:
+        d: declaration of the parameter.
+        intervals: 90 % interval of each motor.
+        wider: further std of the logarithm.
     """
-    values, stds = np.transpose(known)
-    spread = np.std(values, ddof=1) if len(values) > 1 else 0.0
-    return float(np.mean(values)), float(np.hypot(spread, np.mean(stds)))
+    positive = replace(d, lower=0.0) if np.isinf(d.lower) else d
+    ends = np.array([positive.to_search(pair) for pair in intervals])
+    centres, stds = ends.mean(axis=1), np.diff(ends)[:, 0] / (2 * Z95)
+    spread = np.std(centres, ddof=1) if len(centres) > 1 else 0.0
+    z, std = centres.mean(), np.linalg.norm([spread, stds.mean(), wider])
+    low, mean, high = positive.to_si(z + Z95 * std * np.array([-1.0, 0.0, 1.0])).tolist()
+    # The brush drop of a robot has any sign and a normal prior: its interval has the same width.
+    return _Prior(mean, float(d.slope(mean) * std if d is positive else (high - low) / (2 * Z95)))
 
 
-def _read(path: Path, where: str) -> Identified:
-    """Return the identified parameters in a bench file.
+def _read(path: Path, where: str) -> Intervals:
+    """Return the intervals of the parameters that a bench determines, from its file.
 
     `where` is the config and key that name the file, for messages.
     """
@@ -90,13 +122,15 @@ def _read(path: Path, where: str) -> Identified:
             "the parameters of a robot, not of a motor" if schema == SCHEMA else f"schema {schema}"
         )
         raise DataError(f"{where}: {path}: {found}; expected {_EXPECTED}")
-    known: Identified = {}
+    known: Intervals = {}
     try:
         for full, number in content["parameters"].items():
-            if number["verdict"] == "identified":
+            if number["verdict"] in KNOWN:
                 name = full.partition("@")[0].removeprefix("motor.")
-                estimate = float(number["value"]), float(number["std"])
-                known.setdefault(name, []).append(estimate)
+                low, high = map(float, number["interval90"])
+                if name in NAMES and not 0 < low < high:
+                    raise ValueError(f"{full}: interval from {low} to {high}")
+                known.setdefault(name, []).append((low, high))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{where}: {path}: damaged ({error}); expected {_EXPECTED}") from error
     return known

@@ -86,7 +86,8 @@ class WheeledDrive(Section):
             one ammeter, in the order of the columns of the logs. With [[1, 3], [2, 4]], one motor
             drives both left wheels and one both right wheels. By default, each wheel has a motor.
         motor: result of `slipid identify` or `slipid motor` for the robot's motor on a test bench;
-            its path is relative to the config.
+            its path is relative to the config. Intervals of resistance, back-EMF, brush drop and
+            friction that are identified or weak there become priors.
         limits: limits of the commands of a controller.
         sensors: noise of the robot's sensors.
         actuators: response of the wheels to commands.

@@ -487,7 +487,8 @@ def of_torques(runs: Runs, robot: Robot) -> list[Choice]:
     if not runs.current_is_torque:
         return []
     values = {"back_emf": 1.0 / float(robot.motor.gear_ratio), "efficiency": 1.0}
-    held = ("resistance", "inductance", "brush_drop")
+    brushes = ("brush_drop", "brush_current", "brush_shape", "brush_tail")
+    held = ("resistance", "inductance", *brushes)
     return [
         *(Choice(f"motor.{name}", fixed=value) for name, value in values.items()),
         *(Choice(f"motor.{name}", free=False) for name in held),

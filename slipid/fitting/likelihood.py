@@ -292,7 +292,8 @@ def electric_residuals(
     if b.has_voltage:
         amps = predicted + _true_current_share(b, noise)[0] * (b.current - predicted)
         w = b.turn / b.dt[..., None]
-        volts = robot.motor.voltage((amps - robot.motor.current_offset) * _direction(b), w)
+        flow = (amps - robot.motor.current_offset) * _direction(b)
+        volts = robot.motor.voltage(flow, w, b.direction)
         out["voltage"] = _flat(volts - b.voltage) / voltage_spread(b, noise)
     return out
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.shared_effects import FittedEffects, SpeedAndLoad
+from slipid.infer.held_out import HeldOut
 from slipid.infer.result import Channels, Fit
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.estimates import Estimate
@@ -132,10 +133,16 @@ def identified_json(fit: Fit) -> Content:
         "surfaces": list(fit.robot.surfaces.labels),
         "curves": curves_json(fit.curves),
         "validity": {floor: asdict(v) for floor, v in fit.validity.items()},
+        **_held_out_json(fit),
         "messages": list(fit.messages),
         **_selected_json(fit),
         "data": {"hash": fit.data_hash, "runs": [name for name, _ in fit.runs]},
     }
+
+
+def _held_out_json(fit: Fit) -> Content:
+    """Return the errors of motor currents in held-out windows, if voltages were logged."""
+    return {} if fit.held_out is None else {"held_out": fit.held_out.to_json()}
 
 
 def _selected_json(fit: Fit) -> Content:
@@ -195,6 +202,7 @@ def to_json(fit: Fit) -> Content:
         | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)})
         | ({} if fit.refused is None else {"refused": dict(fit.refused)}),
         "current_trend": list(fit.current_trend),
+        **_held_out_json(fit),
         "shared": {
             floor: [asdict(p) for p in found.speeds_and_loads]
             for floor, found in fit.shared.items()
@@ -248,6 +256,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
             for path, (value, origin) in content.get("robot_settings", {}).items()
         },
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
+        held_out=HeldOut.of_json(content["held_out"]) if "held_out" in content else None,
         shared={
             floor: FittedEffects(
                 tuple(SpeedAndLoad(**pace) for pace in paces),

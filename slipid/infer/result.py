@@ -21,6 +21,7 @@ from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
 from slipid.fitting.shared_effects import FittedEffects
 from slipid.fitting.variances import Search, Square
+from slipid.infer.held_out import HeldOut, doubted
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import disputes, marked
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
@@ -110,6 +111,8 @@ class Fit:
         robot_settings: limits of the robot, noise of its sensors and delays of its actuators, as
             far as config or logs give them: value and origin ("config" or "logs"), keyed by path in
             robot.json.
+        held_out: errors of motor currents that are predicted from voltages, beside those of least
+            squares; None without currents and voltages.
         mixed: test of the runs over several floors: their prediction errors in a fit to all other
             runs, and in fits that include half of them; and the end-point errors of the runs on one
             floor, keyed by floor, before and after the runs over several floors were added.
@@ -144,6 +147,7 @@ class Fit:
     suspects: tuple[str, ...] = ()
     robot_settings: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     current_trend: tuple[float, float] = (0.0, 0.0)
+    held_out: HeldOut | None = None
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None
     shared: Mapping[str, FittedEffects] = field(default_factory=dict)
@@ -349,7 +353,7 @@ class Fit:
         """Every parameter, keyed by path, with interval and verdict."""
         volts, flat = self.channels.voltage, members(self.flat)
         found = estimates(self.verdict_space, self.choices, self.z, self.covariance, volts, flat)
-        return marked({e.path: e for e in found}, self.disputes)
+        return doubted(marked({e.path: e for e in found}, self.disputes), self.held_out)
 
     @cached_property
     def verdict_space(self) -> Space:
@@ -381,7 +385,7 @@ class Fit:
     def derived(self) -> dict[str, Estimate]:
         """Ratios of parameters, keyed by path; one may be identified even if its parts are not."""
         found = derived(self.space, self.z, self.covariance, self.channels.voltage)
-        return {e.path: e for e in found}
+        return doubted({e.path: e for e in found}, self.held_out)
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -406,6 +410,12 @@ class Fit:
             for e in self.parameters.values()
             if e.pull is not None and abs(e.pull) > CONFLICT_STDS and e.verdict != "at_bound"
         ]
+        if self.held_out is not None and self.held_out.worse_than:
+            found.append(
+                "least squares predict held-out motor currents from voltages better than the "
+                "fitted motor, so that resistance and back-EMF are at most weak: the model lacks "
+                "something that acts in the motors"
+            )
         return (*found, *sentences(self.flat))
 
     @property

@@ -8,8 +8,10 @@ from slipid.data.runs import Runs
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import Optimum
 from slipid.fitting.problem import Problem
+from slipid.fitting.variances import Blocks
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.result import Channels, Fit, draws
+from slipid.infer.robot_held_out import robot_held_out
 from slipid.predict.predictive import force_balance_of
 from slipid.search_space import Choice
 
@@ -31,10 +33,12 @@ def summarise(
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
     contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.full_weight)
-    remaining, name = _remaining(problem, optimum)
+    linear = problem.linear(z, problem.electric(z, log_v))
+    remaining, name = _remaining(problem, optimum, linear)
     settled = remaining < LARGEST_REMAINING
     stuck = f"the solver stopped although its next step would change {name} by {remaining:.2g} stds"
     windows, robot = problem.windows, contact.robot
+    judged = windows.has_current and windows.has_voltage and not data.current_is_torque
     several = draws(z, contact.covariance, 400, seed)
     unit = {c.name: c.unit for c in problem.noise.components}
     return Fit(
@@ -68,22 +72,23 @@ def summarise(
         current_trend=curves_of.current_trend(robot, problem.batch)
         if windows.has_current
         else (0.0, 0.0),
+        held_out=robot_held_out(problem, optimum.state, linear) if judged else None,
         data=data,
         problem=problem,
         optimum=optimum,
     )
 
 
-def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
+def _remaining(
+    problem: Problem, optimum: Optimum, linear: tuple[Blocks, Blocks]
+) -> tuple[float, str]:
     """Return the largest coordinate of a full Gauss-Newton step [posterior std], and its name.
 
     The stds are those of the Laplace covariance, as in the stopping rule of the rounds. Stds from
     the solver's own Jacobian would be too small for friction, since the solver holds the contact
     forces fixed.
     """
-    state = optimum.state
-    linear = problem.linear(state.z, problem.electric(state.z, state.log_variance))
-    found = newton_step(problem, state, linear, problem.full_weight)
+    found = newton_step(problem, optimum.state, linear, problem.full_weight)
     steps = np.abs(found.step) / np.sqrt(np.diag(optimum.covariance))
     worst = int(np.argmax(steps))
     return float(steps[worst]), problem.space.names[worst]

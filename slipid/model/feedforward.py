@@ -24,6 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.model.motor import brush_voltage
+
 Z95 = 1.6448536269514722
 """The 95 % quantile of a standard Gaussian."""
 MATTERS = 0.05
@@ -138,6 +140,8 @@ class DriveNumbers(NamedTuple):
         load_inertia: J_load at the output of the gear [kg m^2].
         brush_drop: V_b [V].
         brush_current: I_b, over which the drop of the brushes builds up [A].
+        brush_shape: kappa, from 0 for an exponential to 1 for a hyperbolic tangent [1].
+        brush_tail: q, part of the drop that grows with the logarithm of the current [1].
         efficiency: eta of the gear [1].
         gear_ratio: n, motor speed over the speed at the output of the gear [1].
     """
@@ -150,6 +154,8 @@ class DriveNumbers(NamedTuple):
     load_inertia: float | Array = 0.0
     brush_drop: float | Array = 0.0
     brush_current: float | Array = 0.05
+    brush_shape: float | Array = 0.0
+    brush_tail: float | Array = 0.0
     efficiency: float | Array = 1.0
     gear_ratio: float | Array = 1.0
 
@@ -157,7 +163,8 @@ class DriveNumbers(NamedTuple):
         """Return kS [V], kV [V s/rad] and kA [V s^2/rad]."""
         constant = self.gear_ratio * self.efficiency * self.back_emf
         dry = self.coulomb_friction / constant
-        drop = self.brush_drop * (1 - jnp.exp(-jnp.abs(dry) / self.brush_current))
+        brushes = self.brush_drop, self.brush_current, self.brush_shape, self.brush_tail
+        drop = brush_voltage(*map(jnp.asarray, (abs(dry), *brushes)))[0]
         rotor = self.efficiency * self.gear_ratio**2 * self.rotor_inertia
         return jnp.stack(
             [

@@ -1,4 +1,7 @@
-"""Brushed DC motor: U = R I + C_e wm + L_a dI/dt + brush drop, wm the motor speed [rad/s]."""
+"""Brushed DC motor: U = R I + C_e wm + L_a dI/dt + D(I), wm the motor speed [rad/s].
+
+D is the voltage drop of the brushes, with the sign of the current (`brush_voltage`).
+"""
 
 from functools import partial
 
@@ -6,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.parameter import as_numbers, parameter
+from slipid.parameter import Numbers, as_numbers, parameter
 
 electric = partial(parameter, electric=True)
 
@@ -17,6 +20,12 @@ It is about the resolution of the speed signal."""
 
 FRICTION_SPEED = 0.2
 """Wheel speed over which friction changes its sign [rad/s]."""
+
+NEWTON_STEPS = 8
+"""Number of Newton steps from a voltage to its current.
+
+The equation is concave and the start too small, so that the steps approach the solution from one
+side."""
 
 held = partial(electric, free=False)
 """Declaration of an electric parameter that is fixed unless the user frees it."""
@@ -35,6 +44,32 @@ class Motor(eqx.Module):
     )
     inductance: Array = held("H", "L_a", "inductance", start=0.005, lower=0.0, spread=1.0)
     brush_drop: Array = held("V", "U_b", "voltage drop of the brushes", start=0.0, spread=0.5)
+    brush_current: Array = held(
+        "A",
+        "I_b",
+        "current over which the brushes reach their drop",
+        start=0.025,
+        lower=0.0,
+        spread=1.5,
+    )
+    brush_shape: Array = held(
+        "1",
+        "kappa",
+        "shape of the brush drop over current, from exponential (0) to tanh (1)",
+        start=1.0,
+        lower=0.0,
+        upper=1.001,
+        spread=2.0,
+    )
+    brush_tail: Array = held(
+        "1",
+        "q",
+        "part of the brush drop that grows with the logarithm of the current",
+        start=0.0,
+        lower=-0.001,
+        upper=1.0,
+        spread=1.5,
+    )
     efficiency: Array = held(
         "1", "eta", "efficiency of the gear", start=0.9, lower=0.0, upper=1.001, spread=0.5
     )
@@ -58,12 +93,45 @@ class Motor(eqx.Module):
     gear_ratio: Array = eqx.field(converter=as_numbers, default=1.0)
 
     def voltage(
-        self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
+        self,
+        current: Float[Array, " *w"],
+        wheel_speed: Float[Array, " *w"],
+        direction: Float[Array, " *w"] | None = None,
     ) -> Float[Array, " *w"]:
-        """Return the steady terminal voltage [V] at a signed current and wheel speed [rad/s]."""
+        """Return the steady terminal voltage [V] at a signed current and wheel speed [rad/s].
+
+        If current and speed are means over some time, `direction` is as in `friction`, and the
+        result is the mean voltage: the drop of the brushes reverses with the motion.
+        """
+        share, (forward, size) = _share_of_motion(wheel_speed, direction), _sign_and_size(current)
+        drop = forward * share * self._drop(size / share)[0]
         wm = self.gear_ratio * wheel_speed
-        drop = self.brush_drop * jnp.tanh(current / 0.05)
         return self.resistance * current + self.back_emf * wm + drop
+
+    def current_at(
+        self,
+        voltage: Float[Array, " *w"],
+        wheel_speed: Float[Array, " *w"],
+        direction: Float[Array, " *w"] | None = None,
+    ) -> Float[Array, " *w"]:
+        """Return the signed steady current [A] at a terminal voltage, the inverse of `voltage`."""
+        share = _share_of_motion(wheel_speed, direction)
+        wm = self.gear_ratio * wheel_speed
+        forward, size = _sign_and_size((voltage - self.back_emf * wm) / share)
+        # A drop is at most that of the current without a drop, and steepest at rest.
+        steepest = jnp.maximum(self._drop(jnp.zeros_like(size))[1], 0.0)
+        least = size / (self.resistance + steepest)
+        x = jnp.maximum((size - self._drop(size / self.resistance)[0]) / self.resistance, least)
+        for _ in range(NEWTON_STEPS):
+            drop, slope = self._drop(x)
+            slope = jnp.maximum(slope, 0.0)
+            x = jnp.maximum((size - drop + slope * x) / (self.resistance + slope), least)
+        return forward * share * x
+
+    def _drop(self, size: Float[Array, " *w"]) -> tuple[Array, Array]:
+        """Return the drop of the brushes at the size of a current, and its derivative."""
+        shape = self.brush_shape, self.brush_tail
+        return brush_voltage(size, self.brush_drop, self.brush_current, *shape)
 
     def friction(
         self, wheel_speed: Float[Array, " *w"], direction: Float[Array, " *w"] | None = None
@@ -124,6 +192,48 @@ class Motor(eqx.Module):
 def sign_of_motion(wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
     """Return the sign of a wheel speed, tanh(w / w0) with w0 = `FRICTION_SPEED`."""
     return jnp.tanh(wheel_speed / FRICTION_SPEED)
+
+
+def _share_of_motion(
+    wheel_speed: Float[Array, " *w"], direction: Float[Array, " *w"] | None
+) -> Array | float:
+    """Return the mean sign of the motion over the sign of its mean speed [1], at most 1.
+
+    It is 1 at steady speeds, and otherwise about the share of the time in which a wheel moves, less
+    that in which it moves backwards. `direction` is as in `Motor.friction`.
+    """
+    if direction is None:
+        return 1.0
+    mean, of_mean = (jnp.sqrt(x**2 + 1e-12) for x in (direction, sign_of_motion(wheel_speed)))
+    return jnp.minimum(mean / of_mean, 1.0)
+
+
+def _sign_and_size(x: Array) -> tuple[Array, Array]:
+    """Return the sign, 1 at 0, and the size of numbers; at 0 the size has the slope 1."""
+    forward = jnp.where(x < 0, -1.0, 1.0)
+    return forward, forward * x
+
+
+def brush_voltage(
+    size: Numbers, drop: Array, scale: Array, shape: Array, tail: Array
+) -> tuple[Array, Array]:
+    """Return the voltage drop of brushes [V] at the size of a current, and its derivative.
+
+    D(I) = U_b [(1 - q) (1 - e) / (1 + kappa e) + q log(1 + I / I_b)] with e = exp(-I / I_b). It is
+    concave.
+
+    Args:
+        size: size of the current I [A].
+        drop: U_b [V].
+        scale: I_b [A].
+        shape: kappa, 0 for an exponential and 1 for tanh(I / (2 I_b)) [1].
+        tail: q [1].
+    """
+    e, ratio = jnp.exp(-size / scale), size / scale
+    below = 1 + shape * e
+    voltage = drop * ((1 - tail) * (1 - e) / below + tail * jnp.log(1 + ratio))
+    rise = drop / scale * ((1 - tail) * e * (1 + shape) / below**2 + tail / (1 + ratio))
+    return voltage, rise
 
 
 def signed(

@@ -9,7 +9,7 @@ from rich.text import Text
 
 from slipid.report.calibration import show_calibration
 from slipid.report.gains import show_gains
-from slipid.report.held_out import held_out_sentence
+from slipid.report.held_out import PREDICTED, held_out_sentence
 from slipid.report.numbers import interval, rounded
 from slipid.report.page import Groups, Page, counted, grouped, in_two_lines, table, verdict
 from slipid.support.content import Content
@@ -143,6 +143,8 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     show_ratios(page, fit.derived.values())
     for profile in profiles:
         page.line(f"profile: {profile.sentence}")
+    if fit.held_out is not None:
+        page.line(held_out_sentence(fit.held_out, PREDICTED))
     page.notes(fit.messages)
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 

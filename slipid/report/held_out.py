@@ -5,14 +5,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from slipid.infer.bench.held_out import Errors, HeldOut
+    from slipid.infer.held_out import HeldOut
 
 WORDS = {
     "least_squares": "least squares",
     "least_squares_with_offset": "least squares with offsets",
 }
 """Names of the rivals in words."""
-ABOUT = "held-out rows, simulated from the voltage alone"
+SIMULATED = "held-out rows, simulated from the voltage alone"
+PREDICTED = "motors in held-out windows, from voltage and wheel speed"
 
 
 @dataclass(frozen=True)
@@ -34,24 +35,24 @@ class HeldOutRow:
 
 def held_out_rows(found: "HeldOut") -> Iterator[HeldOutRow]:
     """Yield the errors of each channel that was logged."""
-
-    def row(channel: str, unit: str, size: float, rivals: dict[str, float]) -> HeldOutRow:
-        others = {WORDS[name]: f"{x:.3g}" for name, x in rivals.items()}
-        return HeldOutRow(channel, unit, f"{size:.3g}", others)
-
-    def currents(errors: dict[str, "Errors"]) -> dict[str, float]:
-        return {name: e.current for name, e in errors.items() if e.current is not None}
-
     own, rivals = found.errors, found.rivals
-    yield row("speed", "rad/s", own.speed, {name: e.speed for name, e in rivals.items()})
-    if own.current is not None:
-        yield row("current", "A", own.current, currents(rivals))
+    yield from _row("speed", "rad/s", own.speed, {name: e.speed for name, e in rivals.items()})
+    yield from _row("current", "A", own.current, {name: e.current for name, e in rivals.items()})
 
 
-def held_out_sentence(found: "HeldOut") -> str:
-    """Return the errors of all channels in one line."""
+def _row(
+    channel: str, unit: str, size: float | None, rivals: dict[str, float | None]
+) -> Iterator[HeldOutRow]:
+    """Yield the errors of a channel if there are any."""
+    if size is not None:
+        others = {WORDS[name]: f"{x:.3g}" for name, x in rivals.items() if x is not None}
+        yield HeldOutRow(channel, unit, f"{size:.3g}", others)
+
+
+def held_out_sentence(found: "HeldOut", about: str = SIMULATED) -> str:
+    """Return the errors of all channels in one line, which begins with what they are `about`."""
     parts = []
     for row in held_out_rows(found):
         others = ", ".join(f"{name} {size}" for name, size in row.rivals.items())
         parts.append(f"{row.channel} within {row.error} {row.unit} ({others})")
-    return f"{ABOUT}: {'; '.join(parts)}"
+    return f"{about}: {'; '.join(parts)}"

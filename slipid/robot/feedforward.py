@@ -28,7 +28,7 @@ LARGEST_COUPLING = 0.05
 """Largest cosine of the angle between two columns of J at which axes count as independent [1]."""
 MOTOR = (
     *("resistance", "back_emf", "coulomb_friction", "viscous_friction", "rotor_inertia"),
-    *("brush_drop", "efficiency"),
+    *("brush_drop", "brush_current", "brush_shape", "brush_tail", "efficiency"),
 )
 """Names of the parameters of a motor that gains follow from."""
 MASS, YAW_INERTIA = "robot.mass", "robot.yaw_inertia"

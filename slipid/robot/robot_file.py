@@ -156,7 +156,7 @@ def read_robot(path: Path) -> RobotRecord:
             content = _with_assumed(content)
         record = typed(RobotRecord, content)
         same = before or numbers == record.numbers
-        record = _with_radii(record)
+        record = _with_newer(record)
         check_record(record)
     except ValueError as error:
         raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
@@ -168,10 +168,17 @@ def read_robot(path: Path) -> RobotRecord:
     return record
 
 
-def _with_radii(record: RobotRecord) -> RobotRecord:
-    """Return a record with rolling radii of its floors, which earlier versions did not fit."""
-    paths = [f"surface.{name}.rolling_radius" for name in record.labels]
-    missing = {p: RecordedNumber(0.0, "1") for p in paths if p not in record.parameters}
+def _with_newer(record: RobotRecord) -> RobotRecord:
+    """Return a record with the parameters that earlier versions lacked, at their start values.
+
+    These are the rolling radii of floors and the shape of the drop of the brushes.
+    """
+    newer = ("rolling_radius", "brush_current", "brush_shape", "brush_tail")
+    missing = {
+        e.path: RecordedNumber(e.declaration.start, e.declaration.unit)
+        for e in declared_numbers(record)
+        if e.quantity.endswith(newer) and e.path not in record.parameters
+    }
     return replace(record, parameters={**record.parameters, **missing})
 
 

@@ -17,6 +17,7 @@ from slipid.exports.c99.function import Argument, function
 from slipid.exports.c99.lower import UnsupportedError
 from slipid.exports.c99.text import table
 from slipid.exports.text import template
+from slipid.model.motor import Motor
 from slipid.robot.trajectory import SHAPES, tangent
 from tests.helpers import small_twin
 from tests.helpers.compiled_c import NEEDS_COMPILER, QUICK
@@ -64,6 +65,13 @@ def _kept_in_branches(x):
     return jax.lax.fori_loop(0, 4, turn, x) + q
 
 
+BRUSHES = Motor(
+    **{
+        f"brush_{k}": jnp.asarray(x)
+        for k, x in (("drop", 0.4), ("current", 0.2), ("shape", 0.5), ("tail", 0.2))
+    },
+    gear_ratio=16.0,
+)
 LAP = tangent(SHAPES["clothoid"](1.0))
 
 
@@ -226,6 +234,7 @@ FUNCTIONS = {
         SMALL,
     ),
     "a path that waits": (_followed, SMALL, SMALL),
+    "brushes": (lambda u, w: BRUSHES.current_at(u, w), SMALL, SMALL),
     "several times": (_loop, SQUARE),
     "one or the other": (_branch, SMALL, SQUARE, SQUARE),
 }

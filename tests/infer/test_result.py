@@ -9,13 +9,14 @@ import json
 from dataclasses import replace
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, lognorm
 from scipy.stats import f as fisher
 
 from slipid.data.runs import collect
-from slipid.data.windows import windows
+from slipid.data.windows import UNREAD_VARIANCE, windows
 from slipid.fitting.optimise import Optimum, one_round
 from slipid.fitting.problem import FitState, Problem
 from slipid.fitting.variances import DEGREES
@@ -24,6 +25,7 @@ from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.fit_file import identified_json, load, save, to_json
 from slipid.infer.posterior import diagnosis
 from slipid.infer.result import Fit
+from slipid.infer.robot_held_out import robot_held_out
 from slipid.infer.slip_curves import by_encoders, has_steady_command, validity
 from slipid.infer.summary import summarise
 from slipid.infer.verdicts.estimates import estimates
@@ -317,6 +319,62 @@ def test_identified_json_has_the_documented_content():
     assert found["surfaces"] == ["soft"]
     assert set(found["curves"]["soft"]) == {"torque_nm", "slip", "slip_lo", "slip_hi", "at"}
     assert found["data"]["runs"] == [log.name for log in made(True)[1].logs]
+
+
+def held_out_of(change):
+    """Errors in held-out windows of the problem with voltage, after a change of its windows."""
+    problem, _, end = made(True)
+    problem = problem.of(change(problem.windows))
+    electric = problem.electric(end.state.z, end.state.log_variance)
+    return robot_held_out(problem, end.state, problem.linear(end.state.z, electric))
+
+
+def test_motors_are_judged_by_currents_in_held_out_windows():
+    """At the truth, what is left of a current is the noise of both meters."""
+    fit, w = fit_of(True), made(True)[0].windows
+    found = fit.held_out
+    assert fit_of(False).held_out is None
+    assert found == held_out_of(lambda w: w)
+    motor = TRUTH.motor
+    amps = motor.current_at(*map(jnp.asarray, (w.voltage, w.turn / w.dt[..., None], w.direction)))
+    shown = np.abs(amps) if not w.current_is_signed else np.asarray(amps)
+    noise = np.sqrt(((shown + float(motor.current_offset) - w.current) ** 2).mean())
+    assert found.errors.speed is None
+    assert found.errors.current == pytest.approx(noise, rel=0.05)
+    assert not found.worse_than
+    assert identified_json(fit)["held_out"] == found.to_json()
+    assert "motors in held-out windows, from voltage and wheel speed: current within" in str(fit)
+
+
+def test_where_least_squares_predict_currents_better_resistance_is_weak():
+    """No robot's motor has a voltage that drives it at rest."""
+    name = "least_squares_with_offset"
+    found = held_out_of(lambda w: dataclasses.replace(w, voltage=w.voltage + 2.0))
+    assert found.worse_than == (name,)
+    fit = dataclasses.replace(fit_of(True), held_out=found)
+    assert fit_of(True)["motor.resistance"].verdict == "identified"
+    assert fit["motor.resistance"].verdict == fit["motor.back_emf"].verdict == "weak"
+    assert fit.derived["motor.resistance/motor.back_emf"].verdict == "weak"
+    assert fit["surface.soft.friction"] == fit_of(True)["surface.soft.friction"]
+    assert any("least squares predict held-out motor currents" in text for text in fit.messages)
+
+
+def test_windows_without_a_reading_are_not_judged():
+    def spoilt(w):
+        lost = np.zeros(w.voltage.shape, bool)
+        lost[:, ::2] = True
+        return dataclasses.replace(
+            w,
+            voltage=np.where(lost, 1e3, w.voltage),
+            voltage_var=np.where(lost, UNREAD_VARIANCE, w.voltage_var),
+        )
+
+    found, whole = held_out_of(spoilt), fit_of(True).held_out
+    assert found.errors.current < 2 * whole.errors.current
+    lost = held_out_of(
+        lambda w: dataclasses.replace(w, voltage_var=np.full(w.voltage.shape, UNREAD_VARIANCE))
+    )
+    assert lost is None
 
 
 def test_the_data_hash_depends_on_names_and_bytes_not_on_order():

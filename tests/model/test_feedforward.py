@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from slipid.model.feedforward import DriveNumbers, Feedforward, Gain, Known, feedforward
+from slipid.model.motor import Motor
 
 WHEEL = {
     "resistance": 1.8,
@@ -45,6 +47,15 @@ def test_the_voltage_balances_all_torques_behind_a_gear(speed, acceleration):
     found = feedforward("wheel", exact(WHEEL))
     assert simulated(found.voltage(speed, acceleration), speed, acceleration) == pytest.approx(0.0)
     assert found.voltage(-speed, -acceleration) == -found.voltage(speed, acceleration)
+
+
+def test_ks_is_the_voltage_of_a_motor_whose_current_only_overcomes_dry_friction():
+    numbers = WHEEL | {"brush_shape": 0.6, "brush_tail": 0.2}
+    found = feedforward("wheel", exact(numbers))
+    motor = Motor(**{name: x for name, x in numbers.items() if name != "load_inertia"})
+    dry = jnp.asarray([WHEEL["coulomb_friction"]]) / motor.gain
+    volts = motor.voltage(dry, jnp.zeros(1))
+    assert found.kS.value == pytest.approx(float(volts[0]), rel=1e-12)
 
 
 def test_a_motor_without_gear_and_brushes_has_the_gains_of_the_textbook():

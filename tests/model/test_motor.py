@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.model.motor import REST, Motor, signed
+from slipid.infer.bench.motor import BenchMotor
+from slipid.model.motor import REST, Motor, sign_of_motion, signed
 
 MOTOR = Motor(
     resistance=jnp.asarray(5.95),
@@ -71,6 +72,82 @@ def test_brush_drop_is_a_voltage_with_the_sign_of_the_current():
     current = jnp.asarray([-1.0, 0.0, 1.0])
     extra = drops.voltage(current, jnp.ones(3)) - plain.voltage(current, jnp.ones(3))
     np.testing.assert_allclose(extra, [-0.7, 0.0, 0.7], atol=1e-12)
+
+
+BRUSHES = replace(
+    MOTOR,
+    brush_drop=jnp.asarray(0.4),
+    brush_current=jnp.asarray(0.2),
+    brush_shape=jnp.asarray(0.5),
+    brush_tail=jnp.asarray(0.2),
+)
+
+
+def test_a_robot_has_the_brush_drop_of_a_bench():
+    names = ("brush_drop", "brush_current", "brush_shape", "brush_tail")
+    bench = BenchMotor(**{name: getattr(BRUSHES, name) for name in names})
+    size = jnp.asarray([0.0, 0.01, 0.2, 3.0])
+    drop, slope = bench.contact_voltage(size, jnp.asarray(0.0))
+    rest = jnp.zeros(4)
+    for sign in (1.0, -1.0):
+        found = BRUSHES.voltage(sign * size, rest) - MOTOR.voltage(sign * size, rest)
+        np.testing.assert_allclose(found, sign * drop, rtol=1e-12, atol=1e-15)
+    slopes = jax.vmap(jax.grad(lambda i: BRUSHES.voltage(i[None], rest[:1])[0]))(size)
+    np.testing.assert_allclose(slopes, 5.95 + slope, rtol=1e-12)
+
+
+INVERTED = (
+    *(
+        (r, drop, scale, k)
+        for r in (0.05, 5.95)
+        for drop in (0.05, 1.5)
+        for scale in (0.01, 5.0)
+        for k in (0.0, 1.0)
+    ),
+    (5.95, -0.02, 1.0, 0.5),
+)
+"""Resistances, drops, their currents and shapes; noise can make a fitted drop negative."""
+
+
+@pytest.mark.parametrize(("resistance", "drop", "scale", "shape"), INVERTED)
+def test_the_current_at_a_voltage_is_the_inverse_of_the_voltage(resistance, drop, scale, shape):
+    motor = replace(
+        BRUSHES,
+        resistance=jnp.asarray(resistance),
+        brush_drop=jnp.asarray(drop),
+        brush_current=jnp.asarray(scale),
+        brush_shape=jnp.asarray(shape),
+    )
+    current = jnp.asarray([0.0, 1e-3, -0.02, 0.3, -2.0, 30.0])
+    for direction in (None, jnp.full(6, 0.4)):
+        volts = motor.voltage(current, jnp.full(6, 2.0), direction)
+        back = motor.current_at(volts, jnp.full(6, 2.0), direction)
+        np.testing.assert_allclose(back, current, rtol=1e-5, atol=1e-8)
+
+
+def test_without_a_brush_drop_the_current_at_a_voltage_is_that_of_the_winding():
+    volts = jnp.linspace(-24.0, 24.0, 41)
+    emf = MOTOR.back_emf * (MOTOR.gear_ratio * SPEEDS)
+    found = MOTOR.current_at(volts, SPEEDS)
+    np.testing.assert_allclose(found, (volts - emf) / MOTOR.resistance, rtol=4e-16)
+
+
+@pytest.mark.parametrize("forward", [1.0, 0.7, 0.5])
+def test_the_drop_of_a_row_is_the_mean_over_its_directions(forward):
+    """A wheel turns forward for a part of the row, and then backward."""
+    sign = jnp.asarray([1.0, -1.0])
+    part = jnp.asarray([forward, 1 - forward])
+    speed, current = 5.0 * sign, 0.6 * sign
+    mean = BRUSHES.voltage(current, speed) @ part
+    direction = sign_of_motion(speed) @ part
+    found = BRUSHES.voltage((current @ part)[None], (speed @ part)[None], direction[None])
+    np.testing.assert_allclose(found[0], mean, rtol=1e-3, atol=1e-12)
+
+
+def test_a_slow_wheel_that_keeps_its_direction_has_the_whole_drop():
+    speed, current = jnp.asarray([0.05]), jnp.asarray([0.6])
+    found = BRUSHES.voltage(current, speed, sign_of_motion(speed))
+    np.testing.assert_allclose(found, BRUSHES.voltage(current, speed), rtol=1e-12)
 
 
 # the paper's torque characterising variable

@@ -94,8 +94,10 @@ def test_evidence_is_that_of_normal_errors_of_the_readings(turn):
     np.testing.assert_allclose(told - none, wanted - of_none, rtol=1e-10)
 
 
-def test_an_ammeter_and_a_voltmeter_count_by_how_sure_each_is():
+@pytest.mark.parametrize("drop", [0.0, 1.5])
+def test_an_ammeter_and_a_voltmeter_count_by_how_sure_each_is(drop):
     robot, w = deployed(), jnp.array([3.0, -2.0, 0.0])
+    robot = eqx.tree_at(lambda r: r.motor.brush_drop, robot, jnp.asarray(drop))
     s = Settings(current_is_signed=True, ammeter_std_a=0.2, voltmeter_std_v=0.3, filter_s=1e-9)
     amps, by_volts = np.array([0.2, -0.3, 0.1]), np.array([0.3, -0.1, 0.0])
     zero = amps + float(robot.motor.current_offset)

@@ -265,6 +265,20 @@ def test_a_file_without_rolling_radii_has_those_of_the_wheels(path, robot):
     np.testing.assert_array_equal(again.floors.rolling_radius, [0.0, 0.0])
 
 
+def test_a_file_without_a_shape_of_the_brush_drop_has_that_of_its_time(path, robot):
+    """It was U_b tanh(I / 0.05 A)."""
+
+    def as_before(content):
+        for name in ("current", "shape", "tail"):
+            assert content["parameters"].pop(f"motor.brush_{name}")
+        content["parameters"]["motor.brush_drop"]["value"] = 0.7
+
+    rewritten(path, as_before)
+    motor, amps = DeployedRobot.load(path, "moved").motor, jnp.asarray([-0.3, 0.02, 0.1])
+    drop = motor.voltage(amps, jnp.zeros(3)) - motor.resistance * amps
+    np.testing.assert_allclose(drop, 0.7 * jnp.tanh(amps / 0.05), rtol=1e-12)
+
+
 def test_limits_without_logs_follow_from_the_robots_own_wheels():
     two = build(differential(0.2, 0.1, 10.0), ["a"])
     record = robot_record(

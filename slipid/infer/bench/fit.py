@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr
 
-from slipid.infer.bench.held_out import HeldOut, held_out
+from slipid.infer.bench.held_out import held_out
 from slipid.infer.bench.least_squares import least_squares
 from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot, noise
 from slipid.infer.bench.open_loop import (
@@ -41,6 +41,7 @@ from slipid.infer.bench.uncertainty import (
     significance,
     uncertainty,
 )
+from slipid.infer.held_out import HeldOut
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 

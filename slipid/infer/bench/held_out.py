@@ -6,7 +6,6 @@ The two sets of parts change places.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool
@@ -15,57 +14,10 @@ from slipid.infer.bench.least_squares import RIVALS, least_squares
 from slipid.infer.bench.motor import BenchMotor
 from slipid.infer.bench.open_loop import Channels, open_loop, values_of
 from slipid.infer.bench.rows import Rows
-from slipid.support.content import Content
+from slipid.infer.held_out import Errors, HeldOut
 
 PARTS = 6
 """Number of parts of a record."""
-BETTER = 0.98
-"""Ratio of root mean squares below which a rival simulates better."""
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Root mean square errors of simulated readings.
-
-    Attributes:
-        speed: of the speed [rad/s].
-        current: of the current, None if it was not logged [A].
-    """
-
-    speed: float
-    current: float | None
-
-    def to_json(self) -> Content:
-        return {"speed_rmse_rad_s": self.speed, "current_rmse_a": self.current}
-
-    def better(self, other: "Errors") -> bool:
-        """Return True if a channel is simulated better than by `other`."""
-        pairs = [(self.speed, other.speed)]
-        if self.current is not None and other.current is not None:
-            pairs.append((self.current, other.current))
-        return any(mine < BETTER * theirs for mine, theirs in pairs)
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Errors of simulated readings that were not used by the fits.
-
-    Attributes:
-        errors: errors of the fitted motor.
-        rivals: errors of least squares, keyed by name.
-    """
-
-    errors: Errors
-    rivals: dict[str, Errors]
-
-    @property
-    def worse_than(self) -> tuple[str, ...]:
-        """Names of the rivals that simulate a channel better."""
-        return tuple(name for name, e in self.rivals.items() if e.better(self.errors))
-
-    def to_json(self) -> Content:
-        rivals = {name: e.to_json() for name, e in self.rivals.items()}
-        return {**self.errors.to_json(), "rivals": rivals}
 
 
 def folds(rows: Rows) -> tuple[Bool[np.ndarray, "segment step"], Bool[np.ndarray, "segment step"]]:

@@ -5,6 +5,8 @@
 Accelerations are central differences of the speed.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,6 +20,42 @@ SIGN_PASSES = 10
 """Number of least squares in which the signs of magnitudes of currents settle."""
 LEAST = 1e-3
 """Smallest estimate of a positive parameter, relative to its scale."""
+
+
+class Winding(NamedTuple):
+    """Constants of U = R I + C_e w + U_0.
+
+    Attributes:
+        resistance: R [ohm].
+        back_emf: C_e [V s/rad].
+        offset: U_0 [V].
+    """
+
+    resistance: float
+    back_emf: float
+    offset: float = 0.0
+
+    def current(self, voltage: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return the current [A] at a voltage [V] and a speed of the shaft [rad/s]."""
+        return (voltage - self.offset - self.back_emf * speed) / self.resistance
+
+
+def fitted_winding(
+    current: Float[np.ndarray, " row"],
+    speed: Float[np.ndarray, " row"],
+    voltage: Float[np.ndarray, " row"],
+    with_offset: bool,
+) -> Winding:
+    """Return the constants of least squares, those of resistance and back-EMF positive."""
+    one = [np.ones_like(speed)] if with_offset else []
+    r, c, *zero = _solved([current, speed, *one], voltage)
+    positive = _at_least(r, voltage, current), _at_least(c, voltage, speed)
+    return Winding(*positive, *zero)
+
+
+def _at_least(value: float, over: np.ndarray, per: np.ndarray) -> float:
+    """Return a quotient of two channels, or almost 0 if it is not positive."""
+    return max(value, LEAST * float(np.abs(over).max() / max(np.abs(per).max(), 1e-9)))
 
 
 def least_squares(
@@ -43,11 +81,10 @@ def least_squares(
     one = [np.ones_like(w)] if with_offset else []
     if rows.has_current:
         i = rows.current[inner] if rows.signed else _with_signs(rows.current[inner], w, u)
-        r, c, *zero = _solved([i, w, *one], u)
-        r = max(r, LEAST * float(np.abs(u).max() / max(np.abs(i).max(), 1e-9)))
+        winding = fitted_winding(i, w, u, with_offset)
     else:
-        r, c, zero = 1.0, _solved([w, np.sign(w), a, *one], u)[0], []
-    c = max(c, LEAST * float(np.abs(u).max() / max(np.abs(w).max(), 1e-9)))
+        winding = Winding(1.0, _at_least(_solved([w, np.sign(w), a, *one], u)[0], u, w))
+    r, c, zero = winding
     if not rows.has_current:
         i = u - c * w
     j, b, dry, *i_zero = _solved([a, w, np.sign(w), *one], c * i)
@@ -56,7 +93,7 @@ def least_squares(
     return _motor(
         resistance=r,
         back_emf=c,
-        voltage_offset=zero[0] if zero else 0.0,
+        voltage_offset=zero,
         rotor_inertia=max(j, LEAST * most / hardest),
         viscous_friction=max(b, LEAST**2 * most / fastest),
         coulomb_friction=max(dry, LEAST * most),

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.model.motor import brush_voltage
 from slipid.parameter import Numbers, known, parameter
 
 
@@ -111,16 +112,12 @@ class BenchMotor(eqx.Module):
     def contact_voltage(self, size: Numbers, resistance: Numbers) -> tuple[Array, Array]:
         """Return the voltage D of the contacts at the size of a current, and its derivative.
 
-        D(I) = U_b [(1 - q) (1 - e) / (1 + kappa e) + q log(1 + I / I_b)] + R f(I) I with
-        e = exp(-I / I_b) and f = `relative_fall`.
+        It is that of the brushes (`brush_voltage`) + R f(I) I with f = `relative_fall`.
         """
-        e, ratio = jnp.exp(-size / self.brush_current), size / self.brush_current
-        kappa, tail = self.brush_shape, self.brush_tail
-        below, per = 1 + kappa * e, self.brush_drop / self.brush_current
-        rise = per * ((1 - tail) * e * (1 + kappa) / below**2 + tail / (1 + ratio))
+        scale, shape, tail = self.brush_current, self.brush_shape, self.brush_tail
+        brushes, rise = brush_voltage(size, self.brush_drop, scale, shape, tail)
         fall = self.relative_fall(size)
         bend = self.resistance_fall * jnp.exp(-size / self.fall_current) * size / self.fall_current
-        brushes = self.brush_drop * ((1 - tail) * (1 - e) / below + tail * jnp.log1p(ratio))
         return brushes + resistance * fall * size, rise + resistance * (fall - bend)
 
     def mean_contact_voltage(self, start: Array, end: Array, resistance: Array) -> Array:

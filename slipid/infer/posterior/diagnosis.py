@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.fit_file import curves_json, identified_json, number_json
+from slipid.infer.held_out import doubted
 from slipid.infer.posterior.blocks import Chain, Plan, require_packages
 from slipid.infer.result import Fit, required
 from slipid.infer.verdicts import estimates as verdicts
@@ -221,7 +222,7 @@ def estimates(
         base = replace(old, value=verdicts.plain(value))
         is_flat = e.path in flat
         out[e.path] = verdicts.judged(base, d, value, mean, block, prior, forced, is_flat, z)
-    return marked(out, fit.disputes)
+    return doubted(marked(out, fit.disputes), fit.held_out)
 
 
 def identified(found: Posterior) -> Content:
@@ -232,7 +233,8 @@ def identified(found: Posterior) -> Content:
         content["parameters"][path] = number_json(e)
     z, covariance, volts = flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage
     ratios = verdicts.derived(fit.space, z, covariance, volts, flat)
-    content["derived"] = {e.path: number_json(e) for e in ratios}
+    judged = doubted({e.path: e for e in ratios}, fit.held_out)
+    content["derived"] = {path: number_json(e) for path, e in judged.items()}
     some = flat[:: max(1, len(flat) // 400)]
     curves = curves_of.curves(fit.space, z, some, required(fit.problem).batch)
     return content | {"curves": curves_json(curves), "messages": list(found.messages)}

@@ -125,7 +125,10 @@ def _sum(names: list[str], weight: np.ndarray) -> str:
 
 
 VOLTAGE = "log the motor voltage (or duty and bus voltage)"
-_SCALE = ("motor.resistance", "motor.back_emf", "motor.efficiency", "motor.brush_drop")
+_SCALE = (
+    *("motor.resistance", "motor.back_emf", "motor.efficiency"),
+    *(f"motor.brush_{name}" for name in ("drop", "current", "shape", "tail")),
+)
 _DRAG = ("motor.coulomb_friction", "motor.viscous_friction")
 _FLOOR = "surface"
 _CAMERA = (

@@ -76,7 +76,7 @@ def simulate_windows(
     speed = w.turn / w.dt[..., None]
     signed = flowing - float(truth.motor.current_offset)
     signed = signed if w.current_is_signed else signed * np.asarray(sign_of_motion(speed))
-    volts = np.asarray(_voltage(truth.motor, signed, speed))
+    volts = np.asarray(_voltage(truth.motor, signed, speed, w.direction))
     current = flowing + np.sqrt(w.current_var) * rng.normal(size=amps.shape)
     voltage = volts + rng.normal(size=amps.shape) * std.get("voltage.window", 0.0)
     return replace(

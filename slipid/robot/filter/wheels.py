@@ -243,7 +243,7 @@ def read_currents(
     most = largest_current(robot, s)
     known = jnp.isfinite(z.current) & (jnp.abs(z.current) < most)
     volts = jnp.isfinite(z.voltage) & (jnp.abs(z.voltage) < 1e3)
-    by_volts = (z.voltage - motor.voltage(jnp.zeros_like(w), w)) / motor.resistance
+    by_volts = motor.current_at(z.voltage, w)
     volts &= jnp.abs(by_volts) < most
     var_i, var_u = s.ammeter_std_a**2, (s.voltmeter_std_v / motor.resistance) ** 2
     zero = z.current - motor.current_offset
