@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from slipid.app.config import Config
+from slipid.infer.bench.verdict import VAGUE
 from slipid.infer.verdicts.estimates import Z95
 from slipid.model.motor import Motor
 from slipid.parameter import Declaration, entries
 from slipid.search_space import Choice
+from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json
 
@@ -19,20 +21,34 @@ COPY_NAME = "motor_bench.json"
 """Name of the copy of the bench file in the folder of a robot's results."""
 GEAR_STD = 0.3
 """Std of the change of friction by the robot's gear, relative to the friction on the bench [1]."""
-NAMES = (
-    *("resistance", "back_emf", "brush_drop", "brush_current", "brush_shape", "brush_tail"),
-    *("coulomb_friction", "viscous_friction"),
-)
+CURVE = ("brush_current", "brush_shape", "brush_tail")
+"""Names of the parameters that shape the drop of the brushes, which are taken with it."""
+NAMES = ("resistance", "back_emf", "brush_drop", *CURVE, "coulomb_friction", "viscous_friction")
 """Names of the parameters taken from a bench. Sensor offsets are not taken, since they belong to
 the meters of the bench."""
+NO_DROP_V = 1e-6
+"""Fixed drop of the brushes below which a motor has none [V]."""
 KNOWN = ("identified", "weak")
 """Verdicts with which a parameter is taken from a bench."""
 _EXPECTED = "the identified.json that `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
-Intervals = dict[str, list[tuple[float, float]]]
-"""90 % intervals of a parameter for each motor whose bench determines it, by the parameter's name.
-"""
+class _Found(NamedTuple):
+    """A parameter of one motor in a bench file.
+
+    Attributes:
+        value: estimate, or the fixed value.
+        ends: 90 % interval, None if it is fixed.
+        verdict: verdict.
+    """
+
+    value: float
+    ends: tuple[float, float] | None
+    verdict: str
+
+
+FoundNumbers = dict[str, list[_Found]]
+"""A parameter of each motor of a bench file, keyed by the parameter's name."""
 
 
 class _Prior(NamedTuple):
@@ -42,8 +58,8 @@ class _Prior(NamedTuple):
     std: float
 
 
-def bench_of(config: Config) -> tuple[Path, Intervals] | None:
-    """Return the bench file that a config names and its intervals, or None if it names none.
+def bench_of(config: Config) -> tuple[Path, FoundNumbers] | None:
+    """Return the bench file that a config names and its numbers, or None if it names none.
 
     Raises:
         DataError: the file is missing, damaged, or not the result of a bench.
@@ -70,67 +86,109 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
     bench = bench_of(config)
     if bench is None:
         return [], []
-    path, known = bench
+    path, found = bench
+    taken = _taken(found)
     declared = {e.path: e.declaration for e in entries(Motor())}
     choices = []
-    for name in (name for name in NAMES if name in known):
+    for name, numbers in taken.items():
         power = {"coulomb_friction": 1, "viscous_friction": 2}.get(name, 0)
-        wider = GEAR_STD if power and gear_ratio > 1 else 0.0
-        prior = _prior(declared[name], known[name], wider)
-        times = gear_ratio**power
+        times, free = gear_ratio**power, [one for one in numbers if one.ends is not None]
+        if not free:
+            value = float(np.mean([one.value for one in numbers]))
+            choices.append(Choice(f"motor.{name}", fixed=value))
+            continue
+        prior = _prior(declared[name], free, GEAR_STD if power and gear_ratio > 1 else 0.0)
         choices.append(
             Choice(f"motor.{name}", prior_mean=times * prior.mean, prior_std=times * prior.std)
         )
     lines = [f"motor from {path}: {', '.join(c.pattern for c in choices) or 'nothing'}"]
-    if left_out := [name for name in NAMES if name not in known]:
+    if left_out := [name for name in NAMES if name not in taken]:
         lines.append(f"not taken from {path}, since not identified there: {', '.join(left_out)}")
     return choices, lines
 
 
-def _prior(d: Declaration, intervals: list[tuple[float, float]], wider: float) -> _Prior:
+def _taken(found: FoundNumbers) -> FoundNumbers:
+    """Return the numbers that a robot takes, in the order of `NAMES`.
+
+    A drop of the brushes that was fixed is taken, too, since the resistance was fitted with it. A
+    drop has the curve with which it was fitted, whatever the log says about that curve.
+    """
+    out = {
+        name: [one for one in numbers if one.verdict in KNOWN] for name, numbers in found.items()
+    }
+    if not out.get("brush_drop"):
+        out["brush_drop"] = [
+            one
+            for one in found.get("brush_drop", [])
+            if one.verdict == "fixed" and one.value > NO_DROP_V
+        ]
+    for name in CURVE:
+        out[name] = found.get(name, []) if out["brush_drop"] else []
+    return {name: out[name] for name in NAMES if out.get(name)}
+
+
+def _prior(d: Declaration, numbers: list[_Found], wider: float) -> _Prior:
     """Return the prior of a single motor of which several were measured.
 
     Each interval counts as that of a normal distribution of the logarithm, or of the log-odds for a
-    parameter with two bounds. The std combines the width of the intervals with the spread of their
-    centres. So it contains all that an interval does, such as the models that a log does not
-    distinguish, or the range of a resistance that changes with current.
+    parameter with two bounds, with a std of at least `VAGUE` unless it is identified. The std
+    combines the width of the intervals with the spread of their centres.
 
     Args:
         d: declaration of the parameter.
-        intervals: 90 % interval of each motor.
+        numbers: parameter of each motor, with an interval.
         wider: further std of the logarithm.
     """
     positive = replace(d, lower=0.0) if np.isinf(d.lower) else d
-    ends = np.array([positive.to_search(pair) for pair in intervals])
-    centres, stds = ends.mean(axis=1), np.diff(ends)[:, 0] / (2 * Z95)
+    ends = np.array([positive.to_search(np.array(one.ends)) for one in numbers])
+    least = [0.0 if one.verdict == "identified" else VAGUE for one in numbers]
+    centres, stds = ends.mean(axis=1), np.maximum(np.diff(ends)[:, 0] / (2 * Z95), least)
     spread = np.std(centres, ddof=1) if len(centres) > 1 else 0.0
     z, std = centres.mean(), np.linalg.norm([spread, stds.mean(), wider])
     low, mean, high = positive.to_si(z + Z95 * std * np.array([-1.0, 0.0, 1.0])).tolist()
-    # The brush drop of a robot has any sign and a normal prior: its interval has the same width.
-    return _Prior(mean, float(d.slope(mean) * std if d is positive else (high - low) / (2 * Z95)))
+    if d is positive:
+        return _Prior(mean, float(d.slope(mean) * std))
+    # The brush drop of a robot has any sign, and a normal prior with the same interval.
+    return _Prior((low + high) / 2, (high - low) / (2 * Z95))
 
 
-def _read(path: Path, where: str) -> Intervals:
-    """Return the intervals of the parameters that a bench determines, from its file.
+def _read(path: Path, where: str) -> FoundNumbers:
+    """Return the parameters of `NAMES` in a bench file.
 
     `where` is the config and key that name the file, for messages.
     """
     content = read_json(path, _EXPECTED)
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != SCHEMA or content.get("drive") != "motor":
-        found = (
+        what = (
             "the parameters of a robot, not of a motor" if schema == SCHEMA else f"schema {schema}"
         )
-        raise DataError(f"{where}: {path}: {found}; expected {_EXPECTED}")
-    known: Intervals = {}
+        raise DataError(f"{where}: {path}: {what}; expected {_EXPECTED}")
+    found: FoundNumbers = {}
     try:
         for full, number in content["parameters"].items():
-            if number["verdict"] in KNOWN:
-                name = full.partition("@")[0].removeprefix("motor.")
-                low, high = map(float, number["interval90"])
-                if name in NAMES and not 0 < low < high:
-                    raise ValueError(f"{full}: interval from {low} to {high}")
-                known.setdefault(name, []).append((low, high))
+            name = full.partition("@")[0].removeprefix("motor.")
+            if name in NAMES:
+                found.setdefault(name, []).append(_number(full, number))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{where}: {path}: damaged ({error}); expected {_EXPECTED}") from error
-    return known
+    return found
+
+
+def _number(full: str, number: Content) -> _Found:
+    """Return a parameter from its entry in a bench file.
+
+    Raises:
+        KeyError, TypeError, ValueError: the entry is damaged.
+    """
+    verdict, ends = number["verdict"], number["interval90"]
+    if verdict in KNOWN and ends is None:
+        raise ValueError(f"{full}: no interval")
+    if ends is None:
+        return _Found(float(number["value"]), None, verdict)
+    low, high = map(float, ends)
+    if 0 < low < high:
+        return _Found(float(number["value"]), (low, high), verdict)
+    if verdict in KNOWN:
+        raise ValueError(f"{full}: interval from {low} to {high}")
+    return _Found(float(number["value"]), None, verdict)

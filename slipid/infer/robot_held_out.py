@@ -21,8 +21,8 @@ from slipid.model.motor import Motor, sign_of_motion
 
 SEED = 0
 """Seed of the division of segments into halves."""
-FEWEST = 12
-"""Smallest number of readings in a half."""
+FEWEST = 100
+"""Smallest number of readings in a half; with fewer, a model that is right may lose by chance."""
 
 _current = jax.jit(Motor.current_at)
 

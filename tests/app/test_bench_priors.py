@@ -42,7 +42,10 @@ def priors_of(folder, numbers):
     """Choices and lines of a robot whose bench has the given verdicts and intervals."""
     content = {"schema": "slipid.identified/1", "drive": "motor", "parameters": {}}
     for path, (verdict, ends) in numbers.items():
-        number = {"value": ends[0], "std": 1e-9, "interval90": ends, "verdict": verdict}
+        if verdict == "fixed":
+            number = {"value": ends, "std": None, "interval90": None, "verdict": verdict}
+        else:
+            number = {"value": ends[0], "std": 1e-9, "interval90": ends, "verdict": verdict}
         content["parameters"][f"motor.{path}"] = number
     (folder / "motor.json").write_text(json.dumps(content))
     return bench_priors(parsed(folder / "robot.toml", ROBOT), 16.0)
@@ -58,25 +61,48 @@ def interval_of(path, choices):
 
 
 def test_intervals_of_a_bench_become_those_of_priors(tmp_path):
-    choices, _ = priors_of(tmp_path, {name: ("weak", ends) for name, ends in ENDS.items()})
+    choices, _ = priors_of(tmp_path, {name: ("identified", ends) for name, ends in ENDS.items()})
     assert [c.pattern for c in choices] == [f"motor.{name}" for name in ENDS]
     for name, ends in ENDS.items():
-        found = interval_of(f"motor.{name}", choices)
-        if name == "brush_drop":
-            # A normal distribution has the same width, about the centre of the logarithms.
-            assert found[1] - found[0] == pytest.approx(ends[1] - ends[0])
-            assert found.mean() == pytest.approx(0.3)
-        else:
-            np.testing.assert_allclose(found, ends, rtol=1e-9)
+        np.testing.assert_allclose(interval_of(f"motor.{name}", choices), ends, rtol=1e-9)
 
 
-def test_what_a_bench_does_not_identify_is_not_taken(tmp_path):
-    verdicts = ("identified", "not_identified", "weak", "at_bound", "fixed")
-    numbers = dict(zip(ENDS, ((v, (0.1, 0.2)) for v in verdicts), strict=False))
-    numbers["brush_current"] = ("fixed", None)
-    choices, lines = priors_of(tmp_path, {k: v for k, v in numbers.items() if v[1]})
-    assert [c.pattern for c in choices] == ["motor.resistance", "motor.brush_drop"]
-    assert "not identified there: back_emf, brush_current, brush_shape" in lines[-1]
+def test_a_weak_number_is_known_to_10_percent_at_best(tmp_path):
+    """A misfit or a better rival makes a narrow interval weak, without the truth."""
+    narrow, wide = (0.051, 0.052), (0.7, 1.3)
+    choices, _ = priors_of(tmp_path, {"back_emf": ("weak", narrow), "resistance": ("weak", wide)})
+    low, high = interval_of("motor.back_emf", choices)
+    assert np.log(high / low) / (2 * Z95) == pytest.approx(0.1)
+    assert np.sqrt(low * high) == pytest.approx(np.sqrt(narrow[0] * narrow[1]))
+    np.testing.assert_allclose(interval_of("motor.resistance", choices), wide, rtol=1e-9)
+
+
+@pytest.mark.parametrize("verdict", ["not_identified", "at_bound", "fixed"])
+def test_what_a_bench_does_not_identify_is_not_taken(tmp_path, verdict):
+    lost = 0.05 if verdict == "fixed" else (0.1, 0.2)
+    numbers = {"resistance": ("identified", (0.1, 0.2)), "back_emf": (verdict, lost)}
+    choices, lines = priors_of(tmp_path, numbers)
+    assert [c.pattern for c in choices] == ["motor.resistance"]
+    assert "not identified there: back_emf, brush_drop" in lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("drop", "known"), [(("weak", (0.2, 0.45)), True), (("not_identified", (1e-4, 0.1)), False)]
+)
+def test_a_drop_of_the_brushes_has_the_curve_with_which_it_was_fitted(tmp_path, drop, known):
+    curve = {"brush_current": ("not_identified", (0.1, 0.9)), "brush_shape": ("fixed", 0.3)}
+    choices, _ = priors_of(tmp_path, {"brush_drop": drop, **curve})
+    assert [c.pattern for c in choices] == [f"motor.{k}" for k in ("brush_drop", *curve) if known]
+    if known:
+        np.testing.assert_allclose(interval_of("motor.brush_current", choices), (0.1, 0.9))
+        assert choices[-1].fixed == 0.3
+
+
+@pytest.mark.parametrize(("volts", "known"), [(0.4, True), (1e-9, False)])
+def test_a_drop_that_a_bench_fixed_stays_fixed(tmp_path, volts, known):
+    numbers = {"brush_drop": ("fixed", volts), "brush_current": ("fixed", 0.02)}
+    choices, _ = priors_of(tmp_path, numbers)
+    assert [c.fixed for c in choices] == ([volts, 0.02] if known else [])
 
 
 def test_motors_that_differ_widen_the_prior_of_one(tmp_path):

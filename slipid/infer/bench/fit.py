@@ -8,7 +8,7 @@ A drop of the brushes and a resistance that falls with current explain similar l
 resistances. Both are fitted, and if the log does not distinguish them (Vuong 1989), the intervals
 of resistance and back-EMF are those of a mixture of both. So are they for forms of the voltage
 between rows. The weight of a fit is the probability that it is more likely than the chosen one,
-which itself has weight 1; weights of this kind are called pseudo-BMA+ (Yao et al. 2018).
+which itself has weight 1, similar to the pseudo-BMA+ weights of Yao et al. (2018).
 """
 
 import fnmatch

@@ -26,6 +26,8 @@ LONGEST_STEP = 1.0
 """Largest change of a coordinate of the search space in one step, in prior stds."""
 CONTINUOUS = 1e-6
 """Largest jump between segments, relative to the range of a channel."""
+LEAST_SCALE = 0.05
+"""Smallest first scale of residuals, relative to their root mean square."""
 LATEST = 3.0
 """Longest delay of a speed [row]."""
 MOST_PASSES = 80
@@ -366,11 +368,16 @@ class _Search:
 
 
 def _first_scales(residuals: Channels, use: Channels) -> Float[np.ndarray, " channel"]:
-    """Return robust scales of both channels, 1 for a channel that is not used."""
+    """Return robust scales of both channels, 1 for a channel that is not used.
+
+    They are not 0 if most residuals are, as those of a shaft that rests most of the time.
+    """
     out = np.ones(2)
     for k, (r, w) in enumerate(zip(residuals, use, strict=True)):
         if (w > 0).any():
-            out[k] = max(1.4826 * float(np.median(np.abs(r[w > 0]))), 1e-12)
+            size = np.abs(r[w > 0])
+            usual, mean = 1.4826 * float(np.median(size)), float(np.sqrt(np.mean(size**2)))
+            out[k] = max(usual, LEAST_SCALE * mean, 1e-12)
     return out
 
 

@@ -32,7 +32,8 @@ VAGUE = 0.1
 """Std of resistance or back-EMF over all models that explain a log, relative to the estimate, above
 which the verdict is weak."""
 LONGEST_TIME_CONSTANT_S = 5e-3
-"""Electrical time constant L_a / R above which what the current determines is at most weak [s].
+"""Electrical time constant L_a / R above which resistance, inductance, brush drop, dry friction and
+the zero of the ammeter are at most weak [s].
 
 Those of small motors are shorter, and an ammeter's low-pass filter has almost the same effect."""
 WIDER = 2.0
@@ -314,11 +315,13 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
 
 
 def _slow_current(f: MotorFit) -> float | None:
-    """Return the electrical time constant if it is longer than usual [s], else None."""
+    """Return the electrical time constant if it is fitted and longer than usual [s], else None."""
+    if "motor.inductance" not in f.space.slices or not f.has_voltage:
+        return None
     constant = float(f.motor.inductance / f.motor.resistance)
-    return (
-        constant if f.has_voltage and f.has_current and constant > LONGEST_TIME_CONSTANT_S else None
-    )
+    at = f.space.slices["motor.inductance"].start
+    least = constant * np.exp(-Z95 * np.sqrt(f.covariance[at, at]))
+    return constant if least > LONGEST_TIME_CONSTANT_S else None
 
 
 def _one_point(f: MotorFit) -> bool:

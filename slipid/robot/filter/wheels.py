@@ -245,6 +245,7 @@ def read_currents(
     volts = jnp.isfinite(z.voltage) & (jnp.abs(z.voltage) < 1e3)
     by_volts = motor.current_at(z.voltage, w)
     volts &= jnp.abs(by_volts) < most
+    # The variance of a current from a voltage is smaller than this where a drop rises steeply.
     var_i, var_u = s.ammeter_std_a**2, (s.voltmeter_std_v / motor.resistance) ** 2
     zero = z.current - motor.current_offset
     sign = jnp.where(by_volts < 0, -1.0, 1.0)
