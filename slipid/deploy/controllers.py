@@ -145,7 +145,7 @@ def centre_of(row: ControllerRow, robot: DeployedRobot) -> float:
     if robot.holonomic:
         return 0.0
     known = _known(row, robot)
-    speed = known.forward[:, 2] / known.frame.radius
+    speed = jnp.asarray(known.forward[:, 2] / known.frame.radius)
     if row.observer == "contact":
         driven = np.flatnonzero(~np.array(robot.unseen)).tolist()
         twists = [_twist_on(robot, k, speed) for k in driven]

@@ -21,8 +21,10 @@ from slipid.model.motor import Motor, sign_of_motion
 
 SEED = 0
 """Seed of the division of segments into halves."""
-FEWEST = 100
-"""Smallest number of readings in a half; with fewer, a model that is right may lose by chance."""
+FEWEST = 30
+"""Smallest number of readings in a half.
+
+With fewer, a model that is right often loses by chance."""
 
 _current = jax.jit(Motor.current_at)
 
@@ -40,7 +42,7 @@ def robot_held_out(
     w = problem.windows
     read = (w.current_var < UNREAD_VARIANCE) & (w.voltage_var < UNREAD_VARIANCE)
     speed = w.turn / w.dt[..., None]
-    sign = 1.0 if w.current_is_signed else np.asarray(sign_of_motion(jnp.asarray(speed)))
+    sign = 1.0 if w.current_is_signed else np.asarray(sign_of_motion(speed))
     flow = sign * w.current
     half = np.random.default_rng(SEED).permutation(len(w)) % 2
     at = [jnp.asarray(x) for x in (w.voltage, speed, w.direction)]

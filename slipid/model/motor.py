@@ -189,7 +189,7 @@ class Motor(eqx.Module):
         return self.back_emf * current + self.resistance * current**2 * wm / (wm**2 + REST**2)
 
 
-def sign_of_motion(wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
+def sign_of_motion(wheel_speed: Float[Numbers, " *w"]) -> Float[Array, " *w"]:
     """Return the sign of a wheel speed, tanh(w / w0) with w0 = `FRICTION_SPEED`."""
     return jnp.tanh(wheel_speed / FRICTION_SPEED)
 

@@ -362,7 +362,7 @@ def test_where_least_squares_predict_currents_better_resistance_is_weak():
 def test_windows_without_a_reading_are_not_judged():
     def spoilt(w):
         lost = np.zeros(w.voltage.shape, bool)
-        lost[:, ::2] = True
+        lost[:, 0, 0] = True
         return dataclasses.replace(
             w,
             voltage=np.where(lost, 1e3, w.voltage),
