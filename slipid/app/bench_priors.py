@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from slipid.app.config import Config
-from slipid.infer.bench.verdict import VAGUE
 from slipid.infer.verdicts.estimates import Z95
 from slipid.model.motor import Motor
 from slipid.parameter import Declaration, entries
@@ -28,6 +27,8 @@ NAMES = ("resistance", "back_emf", "brush_drop", *CURVE, "coulomb_friction", "vi
 the meters of the bench."""
 NO_DROP_V = 1e-6
 """Fixed drop of the brushes below which a motor has none [V]."""
+WEAK_STD = 0.1
+"""Least std of the logarithm of a weak number: a misfit may be larger than its interval [1]."""
 KNOWN = ("identified", "weak")
 """Verdicts with which a parameter is taken from a bench."""
 _EXPECTED = "the identified.json that `slipid identify` of a motor, or `slipid motor --out`, wrote"
@@ -131,7 +132,7 @@ def _prior(d: Declaration, numbers: list[_Found], wider: float) -> _Prior:
     """Return the prior of a single motor of which several were measured.
 
     Each interval counts as that of a normal distribution of the logarithm, or of the log-odds for a
-    parameter with two bounds, with a std of at least `VAGUE` unless it is identified. The std
+    parameter with two bounds, with a std of at least `WEAK_STD` unless it is identified. The std
     combines the width of the intervals with the spread of their centres.
 
     Args:
@@ -141,7 +142,7 @@ def _prior(d: Declaration, numbers: list[_Found], wider: float) -> _Prior:
     """
     positive = replace(d, lower=0.0) if np.isinf(d.lower) else d
     ends = np.array([positive.to_search(np.array(one.ends)) for one in numbers])
-    least = [0.0 if one.verdict == "identified" else VAGUE for one in numbers]
+    least = [0.0 if one.verdict == "identified" else WEAK_STD for one in numbers]
     centres, stds = ends.mean(axis=1), np.maximum(np.diff(ends)[:, 0] / (2 * Z95), least)
     spread = np.std(centres, ddof=1) if len(centres) > 1 else 0.0
     z, std = centres.mean(), np.linalg.norm([spread, stds.mean(), wider])

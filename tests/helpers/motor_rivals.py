@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
-import pytest
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
@@ -83,7 +82,8 @@ def by_scipy(records: Sequence[BenchRecord], start: LinearMotor) -> LinearMotor:
 
 def by_casadi(records: Sequence[BenchRecord], start: LinearMotor) -> LinearMotor:
     """Return the motor of CasADi's Ipopt with the Gauss-Newton Hessian, by single shooting."""
-    ca = pytest.importorskip("casadi")
+    import casadi as ca
+
     z, state, inputs = ca.SX.sym("z", 6), ca.SX.sym("x", 2), ca.SX.sym("u", 2)
     r, c, j, b, tau, inductance = ca.vertsplit(ca.exp(z))
     i, w = ca.vertsplit(state)

@@ -348,3 +348,11 @@ def test_an_interval_of_a_mixture_leaves_out_a_twentieth_of_it_on_either_side():
     # Far apart, each of both has a tenth of its own outside: 1.2816 standard deviations.
     both = mixture_quantiles(centres, stds, np.ones(2))
     assert both == pytest.approx([-1.2816, 10 + 2 * 1.2816], abs=1e-3)
+
+
+@pytest.mark.slow
+def test_all_rows_decide_between_forms_that_few_rows_leave_open():
+    """Steps between rows, at which the first rows of this log hardly look."""
+    fit = fit_motor([made.logged(made.driven(made.ROTOR), 1000, seed=2)])
+    assert fit.between == "jumps"
+    assert float(fit.motor.rotor_inertia) == pytest.approx(made.ROTOR, rel=0.02)
