@@ -4,16 +4,18 @@ The form of the voltage between rows (held, straight, or straight with jumps) is
 unless the user gives it. The model has a voltage drop of the brushes. A drift of the resistance
 with time is added only if its estimate is significant.
 
-A drop of the brushes and a resistance that falls with current explain similar logs, with different
-resistances. Both are fitted, and if the log does not distinguish them (Vuong 1989), the intervals
-of resistance and back-EMF are those of a mixture of both. So are they for forms of the voltage
-between rows. The weight of a fit is the probability that it is more likely than the chosen one,
-which itself has weight 1, similar to the pseudo-BMA+ weights of Yao et al. (2018).
+A drop of the brushes, one that grows with the logarithm of the current, and a resistance that falls
+with current explain similar logs, with different resistances. All are fitted, and so are the likely
+forms of the voltage between rows. If the log does not distinguish a fit from the chosen one (Vuong
+1989), the intervals of resistance and back-EMF include those of a mixture of both. Its weight is
+the probability that it is more likely than the chosen one, which itself has weight 1, similar to
+the pseudo-BMA+ weights of Yao et al. (2018).
 """
 
 import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
@@ -45,6 +47,9 @@ from slipid.infer.held_out import HeldOut
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 
+Contacts = Literal["falling", "logarithmic"]
+"""Another model of the contacts than a drop of the brushes: a resistance that falls with current,
+or a drop that grows with the logarithm of the current."""
 FORMS: tuple[Between, ...] = ("held", "straight", "jumps")
 """Forms of the voltage between rows that are tried."""
 WHOLE_DELAYS = (-1.0, 0.0, 1.0)
@@ -63,7 +68,9 @@ UNLIKELY_STDS, LIKELY_STDS = 2.0, 4.0
 """Advantage of a falling resistance over a drop of the brushes below which it is not considered,
 and above which it alone is considered [std]."""
 DROP_SHARE = 0.01
-"""Voltage of the brushes over that of the winding below which both models agree."""
+"""Voltage of the brushes over that of the winding below which all models of them agree."""
+LOGARITHMIC_TAIL = 0.99
+"""Part of the brush drop that grows with the logarithm of the current, where nearly all does."""
 LARGEST_DRIFT = 0.1
 """Usual size of a drift of the resistance in a record [1]."""
 LARGEST_FALL = 0.5
@@ -102,8 +109,7 @@ class MotorFit:
         uncertainty: uncertainty of the search vector.
         ranges: intervals of parameters that more than one model explains, or that change in the
             log, keyed by path [SI].
-        contested: True if the log does not distinguish a drop of the brushes from a falling
-            resistance.
+        other_contacts: other models of the contacts that are about as likely.
         other_forms: forms of the voltage between rows that are about as likely, with other numbers.
         held_out: errors on rows that were not used, None without voltages.
         rounds: number of steps of all fits.
@@ -116,7 +122,7 @@ class MotorFit:
     between: Between
     uncertainty: Uncertainty
     ranges: Mapping[str, tuple[float, float]]
-    contested: bool
+    other_contacts: tuple[Contacts, ...]
     other_forms: tuple[Between, ...]
     held_out: HeldOut | None
     rounds: int
@@ -207,16 +213,16 @@ def fit_motor(
             "several speeds, or start values of resistance and back-EMF in a config"
         )
     best = model.extended(best)
-    compared = [best]
-    if model.is_full and (other := model.with_falling_resistance(best)) is not None:
-        compared.append(other)
-    lead = advantage(compared[-1], compared[0]) if len(compared) > 1 else -np.inf
-    contested = -UNLIKELY_STDS <= lead <= LIKELY_STDS
-    if lead > LIKELY_STDS:
-        compared = compared[::-1]
-    chosen = compared[0]
-    others = [one for one in formed if one is not likeliest and one.is_likely_beside(chosen)]
-    rivals = [*compared[: 1 + contested], *(other.fit for other in others)]
+    contacts = model.with_other_contacts(best)
+    falling = contacts.get("falling", best)
+    chosen = falling if advantage(falling, best) > LIKELY_STDS else best
+    likely: dict[Contacts, OpenLoopFit] = {
+        name: fit
+        for name, fit in contacts.items()
+        if fit is not chosen and _is_likely_beside(chosen, fit)
+    }
+    others = [one for one in formed if one is not likeliest and _is_likely_beside(chosen, one.fit)]
+    rivals = [chosen, *likely.values(), *(other.fit for other in others)]
     known = [uncertainty(fit) for fit in rivals]
     weights = [1.0, *(float(ndtr(advantage(fit, chosen))) for fit in rivals[1:])]
     return MotorFit(
@@ -227,7 +233,7 @@ def fit_motor(
         between=likeliest.form,
         uncertainty=known[0],
         ranges=_ranges(rivals, known, weights),
-        contested=contested,
+        other_contacts=tuple(likely),
         other_forms=tuple(other.form for other in others),
         held_out=_held_out(chosen) if records[0].voltage is not None else None,
         rounds=model.rounds,
@@ -251,14 +257,9 @@ class _Formed:
         """Loss of the fit, and what jumps have to pay."""
         return self.fit.loss + JUMPS_COST * (self.form == "jumps")
 
-    def is_likely_beside(self, best: OpenLoopFit) -> bool:
-        """Return True if another fit is not significantly more likely."""
-        finite = np.isfinite(self.fit.loss) and np.isfinite(best.loss)
-        return bool(finite) and advantage(best, self.fit) <= UNLIKELY_STDS
-
     def rivals(self, best: OpenLoopFit) -> bool:
         """Return True if the likeliest fit has other numbers, but is not clearly likelier."""
-        if not self.is_likely_beside(best):
+        if not _is_likely_beside(best, self.fit):
             return False
         mine, other = self.fit.at.motor, best.at.motor
         ratios = (mine.resistance / other.resistance, mine.back_emf / other.back_emf)
@@ -426,29 +427,35 @@ class _BenchModel:
         found = self.fitted(fit.rows, space, fit.at.motor)
         return min(fit, found, key=lambda f: f.loss)
 
-    def with_falling_resistance(self, fit: OpenLoopFit) -> OpenLoopFit | None:
-        """Return a fit with a falling resistance in place of a drop of the brushes.
+    def with_other_contacts(self, fit: OpenLoopFit) -> dict[Contacts, OpenLoopFit]:
+        """Return fits with other models of the contacts than the drop of the brushes of a fit.
 
-        The result is None if the drop is negligible, or chosen by the user.
+        There are none if the drop is negligible, or chosen by the user.
         """
         m = fit.at.motor
         chosen = any(fnmatch.fnmatchcase("motor.brush_drop", c.pattern) for c in self._choices)
-        if chosen or float(m.brush_drop) < DROP_SHARE * float(m.resistance) * self._amps:
-            return None
-        drifts = "motor.resistance_drift" in fit.space.slices
-        space = self.space(
-            [
-                *_fixed_delay(fit),
-                *([_drift(fit.rows)] if drifts else []),
-                Choice("motor.brush_drop", fixed=_NOTHING),
-                Choice("motor.brush_current", free=False),
-                Choice("motor.brush_shape", free=False),
-                Choice("motor.brush_tail", free=False),
-                Choice("motor.resistance_fall", free=True),
-                Choice("motor.fall_current", free=True),
-            ]
+        share = float(m.brush_drop) / (float(m.resistance) * self._amps)
+        if chosen or not self.is_full or share < DROP_SHARE:
+            return {}
+        found: dict[Contacts, OpenLoopFit] = {
+            "falling": self._with_falling_resistance(fit),
+            "logarithmic": self._with_logarithmic_drop(fit),
+        }
+        return {name: one for name, one in found.items() if np.isfinite(one.loss)}
+
+    def _with_falling_resistance(self, fit: OpenLoopFit) -> OpenLoopFit:
+        """Return a fit with a falling resistance in place of the drop of the brushes."""
+        space = self._like(
+            fit,
+            Choice("motor.brush_drop", fixed=_NOTHING),
+            Choice("motor.brush_current", free=False),
+            Choice("motor.brush_shape", free=False),
+            Choice("motor.brush_tail", free=False),
+            Choice("motor.resistance_fall", free=True),
+            Choice("motor.fall_current", free=True),
         )
         # The resistance at the typical current has the same voltage as with the drop.
+        m = fit.at.motor
         resistance = float(m.resistance) + float(m.brush_drop) / self._typical_current
         fall = min(float(m.brush_drop) / self._typical_current / resistance, LARGEST_FALL)
         start = eqx.tree_at(
@@ -456,8 +463,43 @@ class _BenchModel:
             m,
             [np.asarray(resistance), np.asarray(fall), np.asarray(_NOTHING)],
         )
-        found = self.fitted(fit.rows, space, start)
-        return found if np.isfinite(found.loss) else None
+        return self.fitted(fit.rows, space, start)
+
+    def _with_logarithmic_drop(self, fit: OpenLoopFit) -> OpenLoopFit:
+        """Return a fit whose drop of the brushes grows with the logarithm of the current.
+
+        The prior of `brush_tail` is for fits in which the drop ends; near 1, its distribution is
+        far from a normal one around them.
+        """
+        space = self._like(
+            fit,
+            Choice("motor.brush_tail", fixed=LOGARITHMIC_TAIL),
+            Choice("motor.brush_shape", free=False),
+        )
+        # The drop at a large current stays the same.
+        m, large = fit.at.motor, LARGE_CURRENT * self._amps
+        drop, _ = m.contact_voltage(np.asarray(large), np.asarray(0.0))
+        start = eqx.tree_at(
+            lambda t: [t.brush_drop, t.brush_tail],
+            m,
+            [
+                np.asarray(float(drop) / np.log1p(large / float(m.brush_current))),
+                np.asarray(LOGARITHMIC_TAIL),
+            ],
+        )
+        return self.fitted(fit.rows, space, start)
+
+    def _like(self, fit: OpenLoopFit, *more: Choice) -> Space:
+        """Return the search space with the delay and the drift of a fit, and with choices."""
+        drifts = "motor.resistance_drift" in fit.space.slices
+        drift = [_drift(fit.rows)] if drifts else []
+        return self.space([*_fixed_delay(fit), *drift, *more])
+
+
+def _is_likely_beside(best: OpenLoopFit, fit: OpenLoopFit) -> bool:
+    """Return True if the first fit is not significantly more likely than another one."""
+    finite = np.isfinite(fit.loss) and np.isfinite(best.loss)
+    return bool(finite) and advantage(best, fit) <= UNLIKELY_STDS
 
 
 def _drift(rows: Rows) -> Choice:
@@ -491,8 +533,8 @@ def _ranges(
 ) -> dict[str, tuple[float, float]]:
     """Return the intervals of resistance and back-EMF over fits, and over the log's currents.
 
-    The fits are mixed by their weights. The first one is the chosen one, whose resistance may
-    change in the log.
+    The first fit is the chosen one, whose resistance may change in the log. Each interval reaches
+    to the furthest ends of its mixtures with each other fit, by their weights.
     """
     out: dict[str, tuple[float, float]] = {}
     for path in ("motor.resistance", "motor.back_emf"):
@@ -501,7 +543,9 @@ def _ranges(
         at = [fit.space.slices[path].start for fit in fits]
         centres = np.array([fit.z[k] for fit, k in zip(fits, at, strict=True)])
         stds = np.array([np.sqrt(u.covariance[k, k]) for u, k in zip(known, at, strict=True)])
-        low, high = np.exp(mixture_quantiles(centres, stds, np.array(weights)))
+        pairs = [[0, k] for k in range(len(fits))]
+        ends = [mixture_quantiles(centres[p], stds[p], np.array(weights)[p]) for p in pairs]
+        low, high = np.exp([min(one[0] for one in ends), max(one[1] for one in ends)])
         if path == "motor.resistance":
             least, most = _factors(fits[0])
             low, high = least * low, most * high

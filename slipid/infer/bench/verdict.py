@@ -382,10 +382,15 @@ def _remarks(f: MotorFit) -> list[str]:
             "least squares simulate the held-out rows better than the fitted model, so that no "
             "number is better than weak: the model lacks something that acts in this motor"
         )
-    if f.contested:
+    if "falling" in f.other_contacts:
         found.append(
             "a voltage drop of the brushes and a resistance that falls with current explain the "
             "log about equally well: the interval of the resistance is that of both"
+        )
+    if "logarithmic" in f.other_contacts:
+        found.append(
+            "a voltage drop of the brushes that grows with the logarithm of the current explains "
+            "the log about as well: the interval of the resistance includes it"
         )
     if f.other_forms:
         others = " or ".join(f.other_forms)

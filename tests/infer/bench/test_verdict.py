@@ -166,7 +166,7 @@ def test_a_drop_and_a_falling_resistance_that_are_not_distinguished_widen_the_in
     rows = made.driven(made.FLYWHEEL, drop=0.6, turn=1.0, profile=made.held)
     record = made.logged(rows, made.RATE, 1, noise=(0.05, 0.3, 3.0), at_changes=True)
     both = fit_motor([record], between="held")
-    assert both.contested
+    assert "falling" in both.other_contacts
     low, high = both.ranges["motor.resistance"]
     falling = fit_motor([record], FALLING, between="held")
     at = both.space.slices["motor.resistance"].start
@@ -184,7 +184,7 @@ def test_a_drop_and_a_falling_resistance_that_are_not_distinguished_widen_the_in
 def test_a_steep_drop_is_distinguished_from_a_falling_resistance():
     rows = made.driven(made.FLYWHEEL, drop=0.6, profile=made.held)
     fit = fit_motor([made.logged(rows, made.RATE, 1, at_changes=True)], between="held")
-    assert not fit.contested
+    assert "falling" not in fit.other_contacts
     assert float(fit.motor.brush_drop) == pytest.approx(0.6, abs=0.05)
 
 
