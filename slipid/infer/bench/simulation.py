@@ -6,9 +6,11 @@ The states are the current i and the shaft speed w:
     J dw/dt   = C_e i - b w - F(w)
 
 with the voltage D of the contacts and the dry friction F of `BenchMotor`. The voltage u is held, or
-straight, between rows, and it arrives `voltage_delay` after its row. Within a row, D and F have
-constant means, F at most what stops the shaft, and the linear rest is integrated exactly
-(exponential of a 2 x 2 matrix), however short its time constants are.
+straight, between rows, and it arrives `voltage_delay` after its row. The linear part is integrated
+exactly (exponential of a 2 x 2 matrix), however short its time constants are. Within a row, D and F
+have constant means along a simplified path: the shaft stops in the middle of a row if its friction
+stops it then, and the current follows a jump of the voltage along a ramp. Errors are of second
+order in the time between rows.
 
 Records are cut into segments, which are simulated side by side from given states.
 """
@@ -99,6 +101,11 @@ class _Steps(NamedTuple):
         i_t, w_t: responses to a constant torque of 1 N m against the direction of rotation.
         i_fast: response of the current to a voltage of 1 V at constant speed.
         share: part of the step before the voltage jumps.
+        ramp: duration of the current's transition after the jump over the rest of the step, at
+            least two time constants L_a / R; it may be above 1.
+        lag: time by which the current lags behind D at a constant rate of change, over that rest.
+        kept: part by which it lags behind D because of its transition.
+        early: part of it that is due to D before the jump.
         jumps: 1 if it jumps.
         drop: 1, or 0 if the current is given, so that contacts have no effect.
         resistance: winding resistance [ohm].
@@ -116,6 +123,10 @@ class _Steps(NamedTuple):
     w_t: Array
     i_fast: Array
     share: Array
+    ramp: Array
+    lag: Array
+    kept: Array
+    early: Array
     jumps: Array
     drop: Array
     resistance: Array
@@ -236,13 +247,15 @@ def _step_inputs(values: Float[np.ndarray, " parameter"], inputs: Inputs) -> Ste
 def _stepped(m: BenchMotor, state: State, at: _Steps) -> State:
     """Return the state after a step.
 
-    The torque depends on the mean of D over the step, and the current on D at its end.
+    The torque depends on the mean of D over the step, and the current on D at its end and shortly
+    before.
     """
     i, w = state
     i_free = at.i_0 + at.i_i * i + at.i_w * w
     w_free = at.w_0 + at.w_i * i + at.w_w * w
     before = at.drop * jnp.sign(i) * m.contact_voltage(jnp.abs(i), at.resistance)[0]
-    torque = _friction(m, w, w_free - at.w_e * before, at)
+    resting = m.dry_friction(jnp.zeros_like(w))
+    torque = _friction(m.dry_friction(w), resting, w, w_free - at.w_e * before, at)
     slow = at.i_e - at.i_fast
     end, slope = _through_contacts(m, i_free + at.i_t * torque - slow * before, at)
     softer = 1 + at.drop * at.i_fast * slope
@@ -250,25 +263,44 @@ def _stepped(m: BenchMotor, state: State, at: _Steps) -> State:
     moved = w_free - at.w_e * before + at.w_t * torque - w
     after = end + (1 - at.share) * m.back_emf / at.resistance * moved / softer
     begun = jnp.where(at.jumps > 0, after, i)
-    rest = at.drop * m.mean_contact_voltage(begun, end, at.resistance)
-    mean = at.share * before + (1 - at.share) * rest
+    mean = at.share * before + (1 - at.share) * at.drop * _mean_contacts(
+        m, (i, begun, end), at.ramp / (1 + at.drop * slope / at.resistance), at
+    )
     w_free = w_free - at.w_e * mean
-    new = _friction(m, w, w_free, at)
-    change = at.i_t * (new - torque) - slow * (mean - before)
+    middle = (w + w_free + at.w_t * torque) / 2
+    new = _friction(m.dry_friction(middle), resting, w, w_free, at)
+    late = at.lag * (end - begun) - at.kept * (i - begun)
+    late = (1 - at.early) * late + at.early * (end - i)
+    change = at.i_t * (new - torque) - slow * (mean - before) + at.drop * at.i_fast * slope * late
     return end + change / softer, w_free + at.w_t * new
 
 
-def _friction(m: BenchMotor, w: Array, w_free: Array, at: _Steps) -> Array:
+def _mean_contacts(
+    m: BenchMotor, path: tuple[Array, Array, Array], ramp: Array, at: _Steps
+) -> Array:
+    """Return the mean voltage of the contacts after a jump of the voltage.
+
+    `path` is the current before the jump, after it, and at the end. A ramp of two time constants
+    covers the same area as the exponential transition from the first to the second one.
+    """
+    i, begun, end = path
+    ramp = jnp.minimum(ramp, 1.0)
+    knee = begun + ramp * (end - begun)
+    transition = m.mean_contact_voltage(i, knee, at.resistance)
+    return ramp * transition + (1 - ramp) * m.mean_contact_voltage(knee, end, at.resistance)
+
+
+def _friction(turning: Array, resting: Array, w: Array, w_free: Array, at: _Steps) -> Array:
     """Return the mean dry friction in a step from speed w, which ends at `w_free` without it.
 
-    It is limited to what stops the shaft; if the speed changes its sign, so does the friction.
+    The friction of the shaft is `turning` until it stops, which may be within the step, and then at
+    most `resting`, while it rests or begins to turn. The acceleration counts as constant.
     """
-    most = m.dry_friction(w)
-    full = jnp.clip(-w_free / at.w_t, -most, most)
-    end = w_free + at.w_t * full
-    crosses = (w * end < 0) & (jnp.abs(full) >= most)
-    span = jnp.where(crosses, jnp.abs(w) + jnp.abs(end), 1.0)
-    return jnp.where(crosses, most * (w + end) / span, full)
+    moving = jnp.sign(w) * turning
+    end = w_free + at.w_t * moving
+    until = jnp.where(w * end <= 0, w / jnp.where(w == end, 1.0, w - end), 1.0)
+    holding = jnp.clip((w - w_free) / at.w_t, -resting, resting)
+    return until * moving + (1 - until) * holding
 
 
 def _through_contacts(m: BenchMotor, free: Array, at: _Steps) -> tuple[Array, Array]:
@@ -316,6 +348,10 @@ def _steps(m: BenchMotor, at: StepInputs) -> _Steps:
     w_i, w_w = q.w_i * p.i_i + q.w_w * p.w_i, q.w_i * p.i_w + q.w_w * p.w_w
     c, viscous = m.back_emf, m.viscous_friction
     stiff = resistance * viscous + driven * c**2
+    rate = resistance / _inductance(m, at, resistance)
+    # Times over the electrical time constant: of the step, and of its part after the jump.
+    whole, rest = (jnp.maximum(x * at.step * rate, 1e-3) for x in (1.0, 1 - share * jumps))
+    decayed, gone = jnp.exp(-rest), -jnp.expm1(-rest)
     return _Steps(
         i_i=i_i,
         i_w=i_w,
@@ -329,6 +365,10 @@ def _steps(m: BenchMotor, at: StepInputs) -> _Steps:
         w_t=jnp.minimum((-resistance - w_i * driven * c + w_w * resistance) / stiff, -1e-12),
         i_fast=(1 - jnp.exp(-at.step * resistance / _inductance(m, at, resistance))) / resistance,
         share=share * jumps,
+        ramp=2 / rest,
+        lag=1 / rest - decayed / gone,
+        kept=decayed * (rest / gone - 1),
+        early=(decayed - jnp.exp(-whole)) / -jnp.expm1(-whole),
         jumps=jumps,
         drop=driven * jnp.ones_like(resistance),
         resistance=resistance,
