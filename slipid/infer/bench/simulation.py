@@ -9,8 +9,8 @@ with the voltage D of the contacts and the dry friction F of `BenchMotor`. The v
 straight, between rows, and it arrives `voltage_delay` after its row. The linear part is integrated
 exactly (exponential of a 2 x 2 matrix), however short its time constants are. Within a row, D and F
 have constant means along a simplified path: the shaft stops in the middle of a row if its friction
-stops it then, and the current follows a jump of the voltage along a ramp. Errors are of second
-order in the time between rows.
+stops it then, and the current follows a jump of the voltage along a ramp. Errors are about
+of second order in the time between rows.
 
 Records are cut into segments, which are simulated side by side from given states.
 """
@@ -223,7 +223,8 @@ def _of_steps(
 def _step_inputs(values: Float[np.ndarray, " parameter"], inputs: Inputs) -> StepInputs:
     """Return the voltages of every step after the delay of a motor."""
     late = values[NAMES.index("voltage_delay")] / inputs.period
-    whole = int(np.clip(np.floor(late), -CONTEXT, CONTEXT - 1))
+    # A delay of whole rows is one, however it was rounded.
+    whole = int(np.clip(np.floor(late + 1e-9), -CONTEXT, CONTEXT - 1))
     first, count = CONTEXT + 1 - whole, inputs.step.shape[1]
 
     def rows(x: np.ndarray, offset: int) -> np.ndarray:
@@ -255,7 +256,8 @@ def _stepped(m: BenchMotor, state: State, at: _Steps) -> State:
     w_free = at.w_0 + at.w_i * i + at.w_w * w
     before = at.drop * jnp.sign(i) * m.contact_voltage(jnp.abs(i), at.resistance)[0]
     resting = m.dry_friction(jnp.zeros_like(w))
-    torque = _friction(m.dry_friction(w), resting, w, w_free - at.w_e * before, at)
+    dry = _Dry(m.dry_friction(w), resting, resting)
+    torque = _friction(dry, w, w_free - at.w_e * before, at)
     slow = at.i_e - at.i_fast
     end, slope = _through_contacts(m, i_free + at.i_t * torque - slow * before, at)
     softer = 1 + at.drop * at.i_fast * slope
@@ -267,8 +269,9 @@ def _stepped(m: BenchMotor, state: State, at: _Steps) -> State:
         m, (i, begun, end), at.ramp / (1 + at.drop * slope / at.resistance), at
     )
     w_free = w_free - at.w_e * mean
-    middle = (w + w_free + at.w_t * torque) / 2
-    new = _friction(m.dry_friction(middle), resting, w, w_free, at)
+    last = w_free + at.w_t * torque
+    dry = _Dry(m.dry_friction((w + last) / 2), resting, m.dry_friction(last / 2))
+    new = _friction(dry, w, w_free, at)
     late = at.lag * (end - begun) - at.kept * (i - begun)
     late = (1 - at.early) * late + at.early * (end - i)
     change = at.i_t * (new - torque) - slow * (mean - before) + at.drop * at.i_fast * slope * late
@@ -290,17 +293,26 @@ def _mean_contacts(
     return ramp * transition + (1 - ramp) * m.mean_contact_voltage(knee, end, at.resistance)
 
 
-def _friction(turning: Array, resting: Array, w: Array, w_free: Array, at: _Steps) -> Array:
+class _Dry(NamedTuple):
+    """Dry friction of a shaft that turns, that rests, and that turns again after it has stopped."""
+
+    turning: Array
+    resting: Array
+    again: Array
+
+
+def _friction(dry: _Dry, w: Array, w_free: Array, at: _Steps) -> Array:
     """Return the mean dry friction in a step from speed w, which ends at `w_free` without it.
 
-    The friction of the shaft is `turning` until it stops, which may be within the step, and then at
-    most `resting`, while it rests or begins to turn. The acceleration counts as constant.
+    If the shaft stops within the step, it rests for the remainder, or turns again if more than the
+    friction at rest drives it. The acceleration counts as constant.
     """
-    moving = jnp.sign(w) * turning
+    moving = jnp.sign(w) * dry.turning
     end = w_free + at.w_t * moving
     until = jnp.where(w * end <= 0, w / jnp.where(w == end, 1.0, w - end), 1.0)
-    holding = jnp.clip((w - w_free) / at.w_t, -resting, resting)
-    return until * moving + (1 - until) * holding
+    needed = (w - w_free) / at.w_t
+    rests = jnp.abs(needed) <= dry.resting
+    return until * moving + (1 - until) * jnp.where(rests, needed, jnp.sign(needed) * dry.again)
 
 
 def _through_contacts(m: BenchMotor, free: Array, at: _Steps) -> tuple[Array, Array]:

@@ -172,6 +172,29 @@ def test_drop_friction_and_warming_are_those_of_fine_steps(form, delay, kappa, t
         assert np.abs(one - known).max() < 0.06 * size
 
 
+def test_errors_of_a_reversing_motor_are_small_and_fall_with_the_rows():
+    """The motor stops within rows, and has a friction that falls with speed and a drop."""
+    voltage = 9 * np.interp(np.arange(ROWS), np.arange(-6, ROWS + 12, 12), np.resize([-1, 1], 52))
+
+    def error(parts: int) -> np.ndarray:
+        found, fine = (finely(voltage, n) for n in (parts, 16))
+        return np.sqrt(np.mean((found - fine) ** 2, axis=1)) / np.abs(fine).max(axis=1)
+
+    coarse, half = error(1), error(2)
+    assert (coarse < 5e-4).all()
+    assert (half < 0.7 * coarse).all()
+
+
+def finely(voltage: np.ndarray, parts: int) -> np.ndarray:
+    """Current and speed at the rows, from simulated rows that are parts of them."""
+    fine = np.repeat(voltage, parts)
+    one = replace(record(fine), time=ROW / parts * np.arange(len(fine)))
+    rows = rows_of([one]).between("held")
+    values = FULL | {"resistance_drift": 0.0, "inductance": 4e-4, "brush_shape": 0.3}
+    found = open_loop(rows, values_of(motor(**values)), rows.start)
+    return found.states[rows.used].T[:, parts - 1 :: parts]
+
+
 def test_voltage_slope_and_mean_of_the_contacts_agree():
     shape = {"brush_shape": 0.4, "brush_tail": 0.3, "resistance_fall": 0.5, "fall_current": 2.0}
     m, size = motor(**(FULL | shape)), np.linspace(0.01, 6.0, 40)
@@ -243,5 +266,4 @@ def test_derivatives_are_those_of_finite_differences(signed):
         slope = (readings(z + step) - readings(z - step)) / 2e-5
         off = np.sqrt(np.mean((exact[k] - slope) ** 2, axis=(1, 2)))
         size = np.sqrt(np.mean(slope**2, axis=(1, 2)))
-        # Where the motor stops, friction has a corner, which differences may cross.
-        assert (off < 0.05 * size + 2e-4 * scale).all(), name
+        assert (off < 1e-3 * size + 1e-6 * scale).all(), name
