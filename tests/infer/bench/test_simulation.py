@@ -15,6 +15,9 @@ from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
 from slipid.infer.bench.open_loop import fit_open_loop, open_loop, values_of
 from slipid.infer.bench.rows import Between, rows_of
 from slipid.search_space import Choice, Space
+from tests.helpers import motor_benches
+from tests.helpers.compiled_c import NEEDS_COMPILER
+from tests.helpers.motor_physics import Drop
 
 ROW, ROWS = 2e-3, 600
 """Time between rows [s], and their number."""
@@ -193,6 +196,37 @@ def finely(voltage: np.ndarray, parts: int) -> np.ndarray:
     values = FULL | {"resistance_drift": 0.0, "inductance": 4e-4, "brush_shape": 0.3}
     found = open_loop(rows, values_of(motor(**values)), rows.start)
     return found.states[rows.used].T[:, parts - 1 :: parts]
+
+
+@NEEDS_COMPILER
+@pytest.mark.parametrize("seed", [46, 102, 177, 215, 1016])
+def test_true_parameters_simulate_what_made_benches_do(seed):
+    """The benches have no effect but those of the model; their steps share no code with it."""
+    experiment = motor_benches.drawn(np.random.default_rng(seed))
+    made, row = experiment.motor, experiment.supply.row
+    supply = replace(experiment.supply, pwm_frequency=0.0)
+    experiment = replace(experiment, supply=supply, command=experiment.command[-ROWS:])
+    states, tanh = experiment.run(), made.drop_shape == Drop.TANH
+    one = replace(record(experiment.command), time=row * np.arange(ROWS))
+    rows = rows_of([one]).between("straight" if supply.ramp else "held")
+    true = motor(
+        resistance=made.resistance,
+        back_emf=made.back_emf,
+        inductance=made.inductance,
+        rotor_inertia=made.inertia,
+        viscous_friction=made.viscous,
+        coulomb_friction=made.coulomb,
+        stribeck_friction=made.coulomb * made.stribeck,
+        stribeck_speed=made.stribeck_speed or 1.0,
+        brush_drop=made.drop,
+        brush_current=made.drop_current / (2 if tanh else 1) or 1.0,
+        brush_shape=1.0 if tanh else 1e-9,
+        brush_tail=0.0,
+    )
+    found = open_loop(rows, values_of(true), rows.start).states[rows.used].T
+    for one, known in zip(found, (states.current, states.speed), strict=True):
+        off = np.sqrt(np.mean((one - known[1:]) ** 2)) / np.abs(known).max()
+        assert off < 1.5e-3
 
 
 def test_voltage_slope_and_mean_of_the_contacts_agree():
