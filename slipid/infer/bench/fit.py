@@ -4,12 +4,12 @@ The form of the voltage between rows (held, straight, or straight with jumps) is
 unless the user gives it. The model has a voltage drop of the brushes. A drift of the resistance
 with time is added only if its estimate is significant.
 
-A drop of the brushes, one that grows with the logarithm of the current, and a resistance that falls
-with current explain similar logs, with different resistances. All are fitted, and so are the likely
-forms of the voltage between rows. If the log does not distinguish a fit from the chosen one (Vuong
-1989), the intervals of resistance and back-EMF include those of a mixture of both. Its weight is
-the probability that it is more likely than the chosen one, which itself has weight 1, similar to
-the pseudo-BMA+ weights of Yao et al. (2018).
+A drop of the brushes, one that grows with the logarithm of the current, a resistance that falls
+with current, and a drop with a falling resistance explain similar logs. All are fitted, and so are
+the likely forms of the voltage between rows. If the log does not distinguish a fit from the chosen
+one (Vuong 1989), the intervals of resistance and back-EMF include those of a mixture of both. Its
+weight is the probability that it is more likely than the chosen one, which itself has weight 1,
+similar to the pseudo-BMA+ weights of Yao et al. (2018).
 """
 
 import fnmatch
@@ -47,9 +47,9 @@ from slipid.infer.held_out import HeldOut
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 
-Contacts = Literal["falling", "logarithmic"]
-"""Another model of the contacts than a drop of the brushes: a resistance that falls with current,
-or a drop that grows with the logarithm of the current."""
+Contacts = Literal["falling", "logarithmic", "both"]
+"""Another model of the contacts than a drop of the brushes: a resistance that falls with current, a
+drop that grows with the logarithm of the current, or a drop and a falling resistance."""
 FORMS: tuple[Between, ...] = ("held", "straight", "jumps")
 """Forms of the voltage between rows that are tried."""
 WHOLE_DELAYS = (-1.0, 0.0, 1.0)
@@ -60,15 +60,21 @@ DELAYS_OF_SPEED = (-1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
 """Delays of a speed from which fits may start [row]."""
 JUMPS_COST = 15.0
 """Log-likelihood that jumps between rows have to gain, since they fit noise, too."""
+BOTH_COST = 10.0
+"""Log-likelihood that a drop and a falling resistance have to gain over a drop alone."""
 SAME_NUMBERS = 0.002
 """Relative difference below which resistances and back-EMFs of two forms are the same."""
 SIGNIFICANT_STDS = 4.0
 """Estimate of an effect above which it is added to the model [std]."""
 UNLIKELY_STDS, LIKELY_STDS = 2.0, 4.0
-"""Advantage of a falling resistance over a drop of the brushes below which it is not considered,
-and above which it alone is considered [std]."""
+"""Advantage of the chosen fit above which another one is not considered, and advantage of another
+model of the contacts above which it is chosen [std].
+
+Some rows may mislead, so that a form of the voltage is excluded by the larger advantage there."""
 DROP_SHARE = 0.01
 """Voltage of the brushes over that of the winding below which all models of them agree."""
+SMALL_PART = 0.2
+"""Part of a drop of the brushes from which a fit starts that has a falling resistance, too."""
 LOGARITHMIC_TAIL = 0.99
 """Part of the brush drop that grows with the logarithm of the current, where nearly all does."""
 LARGEST_DRIFT = 0.1
@@ -214,14 +220,18 @@ def fit_motor(
         )
     best = model.extended(best)
     contacts = model.with_other_contacts(best)
-    falling = contacts.get("falling", best)
-    chosen = falling if advantage(falling, best) > LIKELY_STDS else best
+    # A drop that grows with the logarithm is a special case of the first one.
+    free = [best, *(one for name, one in contacts.items() if name != "logarithmic")]
+    leads = [advantage(one, best) for one in free]
+    chosen = free[int(np.argmax(leads))] if max(leads) > LIKELY_STDS else best
     likely: dict[Contacts, OpenLoopFit] = {
         name: fit
         for name, fit in contacts.items()
         if fit is not chosen and _is_likely_beside(chosen, fit)
     }
-    others = [one for one in formed if one is not likeliest and _is_likely_beside(chosen, one.fit)]
+    others = [
+        one for one in formed if _is_likely_beside(chosen, one.fit) and one.differs(likeliest.fit)
+    ]
     rivals = [chosen, *likely.values(), *(other.fit for other in others)]
     known = [uncertainty(fit) for fit in rivals]
     weights = [1.0, *(float(ndtr(advantage(fit, chosen))) for fit in rivals[1:])]
@@ -257,10 +267,8 @@ class _Formed:
         """Loss of the fit, and what jumps have to pay."""
         return self.fit.loss + JUMPS_COST * (self.form == "jumps")
 
-    def rivals(self, best: OpenLoopFit) -> bool:
-        """Return True if the likeliest fit has other numbers, but is not clearly likelier."""
-        if not _is_likely_beside(best, self.fit):
-            return False
+    def differs(self, best: OpenLoopFit) -> bool:
+        """Return True if another fit has another resistance or back-EMF."""
         mine, other = self.fit.at.motor, best.at.motor
         ratios = (mine.resistance / other.resistance, mine.back_emf / other.back_emf)
         return max(abs(float(ratio) - 1) for ratio in ratios) > SAME_NUMBERS
@@ -369,9 +377,9 @@ class _BenchModel:
     def with_forms(self, forms: Sequence[Between]) -> list["_Formed"]:
         """Return fits with forms of the voltage between rows, of which the first is the likeliest.
 
-        The others are those that are not significantly less likely, but have another resistance or
-        back-EMF. Voltages that are held or straight arrive whole rows late, so that their delay is
-        fixed; that of jumps between rows is fitted, and has to pay for it.
+        The others are those that are not clearly less likely. Voltages that are held or straight
+        arrive whole rows late, so that their delay is fixed; that of jumps between rows is fitted,
+        and has to pay for it.
         """
         space = self.space()
         # Start values and priors from the user replace the estimated start values.
@@ -388,7 +396,8 @@ class _BenchModel:
             ]
             found.append(_Formed(form, min(fits, key=lambda fit: fit.loss)))
         best = min(found, key=lambda one: one.loss)
-        return [best, *(one for one in found if one is not best and one.rivals(best.fit))]
+        others = [one for one in found if one is not best]
+        return [best, *(x for x in others if _is_likely_beside(best.fit, x.fit, LIKELY_STDS))]
 
     def of_all(self, rows: Rows, one: "_Formed") -> OpenLoopFit:
         """Return the fit with the form of another one, but to all rows."""
@@ -437,10 +446,14 @@ class _BenchModel:
         share = float(m.brush_drop) / (float(m.resistance) * self._amps)
         if chosen or not self.is_full or share < DROP_SHARE:
             return {}
+        falling = self._with_falling_resistance(fit)
         found: dict[Contacts, OpenLoopFit] = {
-            "falling": self._with_falling_resistance(fit),
+            "falling": falling,
             "logarithmic": self._with_logarithmic_drop(fit),
         }
+        both = self._with_both(fit, falling) if np.isfinite(falling.loss) else falling
+        if both.loss < fit.loss - BOTH_COST:
+            found["both"] = both
         return {name: one for name, one in found.items() if np.isfinite(one.loss)}
 
     def _with_falling_resistance(self, fit: OpenLoopFit) -> OpenLoopFit:
@@ -462,6 +475,24 @@ class _BenchModel:
             lambda t: [t.resistance, t.resistance_fall, t.brush_drop],
             m,
             [np.asarray(resistance), np.asarray(fall), np.asarray(_NOTHING)],
+        )
+        return self.fitted(fit.rows, space, start)
+
+    def _with_both(self, fit: OpenLoopFit, falling: OpenLoopFit) -> OpenLoopFit:
+        """Return a fit with a drop of the brushes and a falling resistance.
+
+        It starts from the fit with a falling resistance, and a small part of the drop.
+        """
+        space = self._like(
+            fit,
+            Choice("motor.resistance_fall", free=True),
+            Choice("motor.fall_current", free=True),
+        )
+        m = fit.at.motor
+        start = eqx.tree_at(
+            lambda t: [t.brush_drop, t.brush_shape, t.brush_tail],
+            falling.at.motor,
+            [np.asarray(SMALL_PART * float(m.brush_drop)), m.brush_shape, m.brush_tail],
         )
         return self.fitted(fit.rows, space, start)
 
@@ -496,10 +527,10 @@ class _BenchModel:
         return self.space([*_fixed_delay(fit), *drift, *more])
 
 
-def _is_likely_beside(best: OpenLoopFit, fit: OpenLoopFit) -> bool:
-    """Return True if the first fit is not significantly more likely than another one."""
+def _is_likely_beside(best: OpenLoopFit, fit: OpenLoopFit, stds: float = UNLIKELY_STDS) -> bool:
+    """Return True if the advantage of the first fit over another one is not large."""
     finite = np.isfinite(fit.loss) and np.isfinite(best.loss)
-    return bool(finite) and advantage(best, fit) <= UNLIKELY_STDS
+    return bool(finite) and advantage(best, fit) <= stds
 
 
 def _drift(rows: Rows) -> Choice:

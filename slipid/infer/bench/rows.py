@@ -164,7 +164,10 @@ def rows_of(records: Sequence[BenchRecord], warm_up: float = 0.0) -> Rows:
 
 
 def excerpt(records: Sequence[BenchRecord], rows: int) -> list[BenchRecord]:
-    """Return about a number of rows of records, in several parts of each record."""
+    """Return about a number of rows of records, in several parts of each record.
+
+    Each part is where the voltage varies most, or the speed if there is none.
+    """
     total = sum(len(r.time) for r in records)
     if total <= 1.5 * rows:
         return list(records)
@@ -172,9 +175,17 @@ def excerpt(records: Sequence[BenchRecord], rows: int) -> list[BenchRecord]:
     for r in records:
         count = int(len(r.time) * rows / total / EXCERPTS)
         for k in range(EXCERPTS if count > 2 * START_ROWS else 0):
-            first = int((k + 0.5) * len(r.time) / EXCERPTS - count / 2)
-            out.append(r.part(first, first + count))
+            part = r.part(k * len(r.time) // EXCERPTS, (k + 1) * len(r.time) // EXCERPTS)
+            first = _most_varied(part.speed if part.voltage is None else part.voltage, count)
+            out.append(part.part(first, first + count))
     return out or list(records)
+
+
+def _most_varied(x: Float[np.ndarray, " row"], count: int) -> int:
+    """Return the first one of a number of consecutive rows with the largest variance."""
+    sums, squares = (np.cumsum(np.append(0.0, y)) for y in (x, x**2))
+    mean, square = ((c[count:] - c[:-count]) / count for c in (sums, squares))
+    return int(np.argmax(square - mean**2))
 
 
 def _averaged(r: BenchRecord, block: int) -> BenchRecord:

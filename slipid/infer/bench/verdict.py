@@ -387,6 +387,11 @@ def _remarks(f: MotorFit) -> list[str]:
             "a voltage drop of the brushes and a resistance that falls with current explain the "
             "log about equally well: the interval of the resistance is that of both"
         )
+    if "both" in f.other_contacts:
+        found.append(
+            "a voltage drop of the brushes together with a resistance that falls with current "
+            "explains the log about as well: the interval of the resistance includes it"
+        )
     if "logarithmic" in f.other_contacts:
         found.append(
             "a voltage drop of the brushes that grows with the logarithm of the current explains "
