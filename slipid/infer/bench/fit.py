@@ -442,19 +442,21 @@ class _BenchModel:
         There are none if the drop is negligible, or chosen by the user.
         """
         m = fit.at.motor
-        chosen = any(fnmatch.fnmatchcase("motor.brush_drop", c.pattern) for c in self._choices)
         share = float(m.brush_drop) / (float(m.resistance) * self._amps)
-        if chosen or not self.is_full or share < DROP_SHARE:
+        if self._is_chosen("motor.brush_drop") or not self.is_full or share < DROP_SHARE:
             return {}
         falling = self._with_falling_resistance(fit)
-        found: dict[Contacts, OpenLoopFit] = {
-            "falling": falling,
-            "logarithmic": self._with_logarithmic_drop(fit),
-        }
+        found: dict[Contacts, OpenLoopFit] = {"falling": falling}
+        if not self._is_chosen("motor.brush_tail"):
+            found["logarithmic"] = self._with_logarithmic_drop(fit)
         both = self._with_both(fit, falling) if np.isfinite(falling.loss) else falling
         if both.loss < fit.loss - BOTH_COST:
             found["both"] = both
         return {name: one for name, one in found.items() if np.isfinite(one.loss)}
+
+    def _is_chosen(self, path: str) -> bool:
+        """Return True if the user has a choice for a parameter."""
+        return any(fnmatch.fnmatchcase(path, c.pattern) for c in self._choices)
 
     def _with_falling_resistance(self, fit: OpenLoopFit) -> OpenLoopFit:
         """Return a fit with a falling resistance in place of the drop of the brushes."""

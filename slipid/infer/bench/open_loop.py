@@ -30,6 +30,8 @@ LEAST_SCALE = 0.05
 """Smallest first scale of residuals, relative to their root mean square."""
 LATEST = 3.0
 """Longest delay of a speed [row]."""
+MOST_SCALINGS, SAME_SCALE = 100, 1e-5
+"""Largest number of updates of the scales, and relative change below which they are settled."""
 MOST_PASSES = 80
 """Largest number of simulations until the states are continuous."""
 
@@ -242,6 +244,7 @@ def fit_open_loop(
     search = _Search(rows, space, use, z)
     while search.rounds < rounds and not search.ended:
         search.step(settled)
+    search.settle_scales()
     residuals = _measured(rows) - search.at.readings
     squares = (residuals / search.scales[:, None, None]) ** 2
     constant = float(use.sum((1, 2)) @ np.log(search.scales))
@@ -352,6 +355,14 @@ class _Search:
         self._damping = max(self._damping / 6, 1e-9)
         self.z, self.at, self.slopes = self.z + step, new, _slopes(self._rows, new)
         self.ended = decrease < settled and expected < settled
+
+    def settle_scales(self) -> None:
+        """Update the scales until they are the likeliest, so that losses of fits compare."""
+        for _ in range(MOST_SCALINGS):
+            old = self.scales
+            self.scales = _next_scales(self._residuals, self._use, old)
+            if not (np.abs(self.scales / old - 1) > SAME_SCALE).any():
+                return
 
     def _normal(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the gradient of the log-posterior and its negative Gauss-Newton Hessian."""

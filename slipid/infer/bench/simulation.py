@@ -101,11 +101,11 @@ class _Steps(NamedTuple):
         i_t, w_t: responses to a constant torque of 1 N m against the direction of rotation.
         i_fast: response of the current to a voltage of 1 V at constant speed.
         share: part of the step before the voltage jumps.
-        ramp: duration of the current's transition after the jump over the rest of the step, at
-            least two time constants L_a / R; it may be above 1.
-        lag: time by which the current lags behind D at a constant rate of change, over that rest.
-        kept: part by which it lags behind D because of its transition.
-        early: part of it that is due to D before the jump.
+        ramp: two electrical time constants over the duration of the rest of the step.
+        lag: mean delay with which D acts on the current at the end, over the same duration, where
+            both change at constant rates.
+        kept: change of the current that this does not include, over that of its transition.
+        early: part of the effect of D on the current at the end that is from before the jump.
         jumps: 1 if it jumps.
         drop: 1, or 0 if the current is given, so that contacts have no effect.
         resistance: winding resistance [ohm].
@@ -362,8 +362,10 @@ def _steps(m: BenchMotor, at: StepInputs) -> _Steps:
     stiff = resistance * viscous + driven * c**2
     rate = resistance / _inductance(m, at, resistance)
     # Times over the electrical time constant: of the step, and of its part after the jump.
-    whole, rest = (jnp.maximum(x * at.step * rate, 1e-3) for x in (1.0, 1 - share * jumps))
+    whole = jnp.maximum(at.step * rate, 1e-3)
+    rest = jnp.maximum(1 - share * jumps, 1e-3) * whole
     decayed, gone = jnp.exp(-rest), -jnp.expm1(-rest)
+    lag = 1 / rest - decayed / gone
     return _Steps(
         i_i=i_i,
         i_w=i_w,
@@ -378,8 +380,8 @@ def _steps(m: BenchMotor, at: StepInputs) -> _Steps:
         i_fast=(1 - jnp.exp(-at.step * resistance / _inductance(m, at, resistance))) / resistance,
         share=share * jumps,
         ramp=2 / rest,
-        lag=1 / rest - decayed / gone,
-        kept=decayed * (rest / gone - 1),
+        lag=lag,
+        kept=decayed * (rest / gone - 1 + lag),
         early=(decayed - jnp.exp(-whole)) / -jnp.expm1(-whole),
         jumps=jumps,
         drop=driven * jnp.ones_like(resistance),

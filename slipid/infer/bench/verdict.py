@@ -385,7 +385,7 @@ def _remarks(f: MotorFit) -> list[str]:
     if "falling" in f.other_contacts:
         found.append(
             "a voltage drop of the brushes and a resistance that falls with current explain the "
-            "log about equally well: the interval of the resistance is that of both"
+            "log about equally well: the interval of the resistance includes both"
         )
     if "both" in f.other_contacts:
         found.append(
@@ -401,7 +401,7 @@ def _remarks(f: MotorFit) -> list[str]:
         others = " or ".join(f.other_forms)
         found.append(
             f"the voltage between rows is {f.between} or {others}, which the log does not "
-            "distinguish: the intervals of resistance and back-EMF are those of all of them; give "
+            "distinguish: the intervals of resistance and back-EMF include all of them; give "
             "--between (voltage_between_rows in a config) if you know it"
         )
     found += _disagreements(f)
