@@ -19,7 +19,6 @@ from scipy.stats import binom
 
 from slipid.infer.bench.checks import check_records
 from slipid.infer.bench.fit import fit_motor
-from slipid.infer.bench.motor import BenchRecord
 from slipid.infer.bench.verdict import bench_fit
 from slipid.support.jax_setup import setup_jax
 from tests.benchmarks.quick import QUICK, quick
@@ -123,14 +122,7 @@ def _overlap(one: tuple[float, float], other: tuple[float, float]) -> bool:
 def judged(seed: int) -> Judged:
     """Return the judgement of the bench of a seed."""
     log = motor_benches.bench(seed)
-    record = BenchRecord(
-        name=f"bench {seed}",
-        sha256="",
-        time=log.time,
-        voltage=log.voltage,
-        current=log.current,
-        speed=log.speed,
-    )
+    record = motor_benches.recorded(log)
     check_records([record], "")
     fit = fit_motor([record])
     found = bench_fit([fit]).parameters

@@ -31,6 +31,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
+from slipid.infer.bench.motor import BenchRecord
 from tests.helpers.motor_experiments import EXCITATIONS, Plan
 from tests.helpers.motor_physics import COPPER, Drop, Motor, States, Supply, simulate, substeps
 
@@ -183,6 +184,18 @@ def bench(seed: int) -> MadeBench:
     experiment = drawn(rng)
     states = experiment.run()
     return logged(rng, experiment, states)
+
+
+def recorded(log: MadeBench) -> BenchRecord:
+    """Return a log as what a fit reads."""
+    return BenchRecord(
+        name="made",
+        sha256="",
+        time=log.time,
+        voltage=log.voltage,
+        current=log.current,
+        speed=log.speed,
+    )
 
 
 def drawn(rng: Generator) -> Experiment:

@@ -9,9 +9,10 @@ import pytest
 
 from slipid.infer.bench.fit import MotorFit, fit_motor
 from slipid.infer.bench.motor import BenchRecord, noise
+from slipid.infer.bench.open_loop import fit_open_loop
 from slipid.infer.bench.rows import Between
 from slipid.infer.bench.signals import fitted_signals
-from slipid.infer.bench.uncertainty import mixture_quantiles
+from slipid.infer.bench.uncertainty import advantage, mixture_quantiles
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.infer.verdicts.estimates import Estimate
 from tests.helpers import made_bench as made
@@ -121,7 +122,8 @@ def test_a_brush_drop_does_not_pass_for_resistance():
     record = made.logged(rows, RATE, 1, at_changes=True)
     found = fitted(record).parameters
     assert least_squares_of(record) > 1.05 * 5.5
-    assert holds(found["motor.resistance"], 5.5)
+    # The small inductance and a part of a row's delay look alike, which moves R by 1.5 %.
+    assert found["motor.resistance"].value == pytest.approx(5.5, rel=0.02)
     assert found["motor.resistance"].std < 0.02 * 5.5
     assert found["motor.brush_drop"].value == pytest.approx(0.6, abs=0.05)
 
@@ -232,6 +234,16 @@ def test_channels_that_are_a_row_late_do_not_change_the_motor(held, held_fit, la
         assert at == pytest.approx(known, abs=0.015), path
     delays = [float(fit.motor.voltage_delay), float(fit.motor.speed_delay)]
     assert np.multiply(delays, RATE) == pytest.approx(rows, abs=0.2)
+
+
+@pytest.mark.slow
+def test_a_fit_that_starts_at_its_optimum_has_the_same_loss(held_fit):
+    """Losses are compared between fits, whatever the number of their steps."""
+    one = held_fit.fit
+    again = fit_open_loop(one.rows, one.space, one.z)
+    assert again.rounds < held_fit.rounds
+    assert again.loss == pytest.approx(one.loss, abs=0.05)
+    assert abs(advantage(again, one)) < 0.1
 
 
 # theorems ----------------------------------------------------------------------------------------

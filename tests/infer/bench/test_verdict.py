@@ -18,6 +18,8 @@ from slipid.report.html.bench_page import bench_page
 from slipid.report.page import text_of
 from slipid.search_space import Choice
 from tests.helpers import made_bench as made
+from tests.helpers import motor_benches
+from tests.helpers.compiled_c import NEEDS_COMPILER
 
 RIVALS = ("least_squares", "least_squares_with_offset")
 
@@ -186,6 +188,38 @@ def test_a_steep_drop_is_distinguished_from_a_falling_resistance():
     fit = fit_motor([made.logged(rows, made.RATE, 1, at_changes=True)], between="held")
     assert "falling" not in fit.other_contacts
     assert float(fit.motor.brush_drop) == pytest.approx(0.6, abs=0.05)
+
+
+@pytest.mark.slow
+@NEEDS_COMPILER
+@pytest.mark.parametrize(
+    ("seed", "other", "text"),
+    [
+        (1184, "logarithmic", "logarithm of the current explains"),
+        (39, "both", "together with a resistance that falls"),
+    ],
+)
+def test_other_models_of_the_contacts_widen_the_interval_up_to_the_truth(seed, other, text):
+    """A drop that is a logarithm, and one beside a contact film."""
+    log = motor_benches.bench(seed)
+    one = fit_motor([motor_benches.recorded(log)])
+    assert other in one.other_contacts
+    assert any(text in message for message in bench_fit([one]).messages)
+    low, high = one.ranges["motor.resistance"]
+    assert low <= log.truth.resistance <= high
+    at = one.space.slices["motor.resistance"].start
+    off = 1.645 * float(np.sqrt(one.covariance[at, at]))
+    alone = np.exp(one.z[at] + np.array([-off, off]))
+    assert low < 0.995 * alone[0] or high > 1.05 * alone[1]
+
+
+@pytest.mark.slow
+def test_a_tail_of_the_drop_that_the_user_gives_has_no_logarithmic_rival():
+    rows = made.driven(made.FLYWHEEL, drop=0.6, profile=made.held)
+    record = made.logged(rows, made.RATE, 3, at_changes=True)
+    one = fit_motor([record], [Choice("motor.brush_tail", fixed=1e-6)], between="held")
+    assert float(one.motor.brush_drop) == pytest.approx(0.6, abs=0.05)
+    assert "logarithmic" not in one.other_contacts
 
 
 def test_a_resistance_that_models_do_not_agree_on_is_weak(fit):
