@@ -175,25 +175,28 @@ def test_drop_friction_and_warming_are_those_of_fine_steps(form, delay, kappa, t
         assert np.abs(one - known).max() < 0.06 * size
 
 
-def test_errors_of_a_reversing_motor_are_small_and_fall_with_the_rows():
-    """The motor stops within rows, and has a friction that falls with speed and a drop."""
+@pytest.mark.parametrize(
+    ("inductance", "largest", "ratio"), [(4e-4, 5e-4, 0.8), (1.2e-2, 2e-3, 0.35)]
+)
+def test_errors_of_a_reversing_motor_fall_with_the_rows(inductance, largest, ratio):
+    """The motor stops within rows; its electrical time constant is shorter or longer than rows."""
     voltage = 9 * np.interp(np.arange(ROWS), np.arange(-6, ROWS + 12, 12), np.resize([-1, 1], 52))
 
     def error(parts: int) -> np.ndarray:
-        found, fine = (finely(voltage, n) for n in (parts, 16))
+        found, fine = (finely(voltage, inductance, n) for n in (parts, 16))
         return np.sqrt(np.mean((found - fine) ** 2, axis=1)) / np.abs(fine).max(axis=1)
 
     coarse, half = error(1), error(2)
-    assert (coarse < 5e-4).all()
-    assert (half < 0.7 * coarse).all()
+    assert (coarse < largest).all()
+    assert (half < ratio * coarse).all()
 
 
-def finely(voltage: np.ndarray, parts: int) -> np.ndarray:
+def finely(voltage: np.ndarray, inductance: float, parts: int) -> np.ndarray:
     """Current and speed at the rows, from simulated rows that are parts of them."""
     fine = np.repeat(voltage, parts)
     one = replace(record(fine), time=ROW / parts * np.arange(len(fine)))
     rows = rows_of([one]).between("held")
-    values = FULL | {"resistance_drift": 0.0, "inductance": 4e-4, "brush_shape": 0.3}
+    values = FULL | {"resistance_drift": 0.0, "inductance": inductance, "brush_shape": 0.3}
     found = open_loop(rows, values_of(motor(**values)), rows.start)
     return found.states[rows.used].T[:, parts - 1 :: parts]
 
