@@ -1,15 +1,16 @@
 """Log density and settings of a sampler, and blocks of its chain with their arrays in files."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import jax
 import numpy as np
-from jaxtyping import Float, Int, UInt32
+from jaxtyping import Bool, Float, Int, UInt32
 
-from slipid.infer.posterior.transport_map import Matrix, Transport, Warp, gaussian
+from slipid.infer.posterior.surrogate import Matrix, Surrogate
 from slipid.support.extras import require
 
-FORMAT = 6
+FORMAT = 7
 """Version of the block files; it must be increased if their content or the algorithm changes."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 
@@ -27,49 +28,42 @@ def require_packages() -> None:
 class LogDensity:
     """A log density that is a sum of terms, with its Gaussian (Laplace) approximation.
 
+    There is one term per group of coordinates, then a term of the coordinates that groups share,
+    which is their log prior. The term of a group is c - |y|^2 / 2 plus the log prior of its own
+    coordinates, with whitened residuals y and a remainder c.
+
     Attributes:
-        terms: function from vectors (walker, size) to the terms of the log density (walker,
-            group + 1): one per group, then the term of the shared coordinates.
-        slope: function from vectors to the gradient of the sum of the terms.
+        terms: function from vectors (walker, size) to the terms (walker, group + 1).
+        rows: function from vectors and a group to y (walker, row) and c (walker,).
+        depends: True where the residuals of a group depend on a coordinate.
         group: group of each coordinate, -1 for coordinates that groups share.
-        centre: mean of the Gaussian.
-        covariance: covariance of the Gaussian.
-        map: map to the coordinates u of which `terms` and `slope` are functions; None if they are
-            functions of x.
+        positive: True for coordinates that are logarithms of positive parameters.
+        prior_mean, prior_std: mean and std of the Gaussian prior; the std is infinite without one.
+        centre, covariance: mean and covariance of the Laplace approximation.
     """
 
     terms: Callable[[Matrix], Matrix]
-    slope: Callable[[Matrix], Matrix]
+    rows: Callable[[Matrix, int], tuple[Matrix, Float[np.ndarray, " walker"]]]
+    depends: Bool[np.ndarray, "group size"]
     group: Int[np.ndarray, " size"]
+    positive: Bool[np.ndarray, " size"]
+    prior_mean: Float[np.ndarray, " size"]
+    prior_std: Float[np.ndarray, " size"]
     centre: Float[np.ndarray, " size"]
     covariance: Matrix
-    map: Transport | None = None
+
+    @property
+    def size(self) -> int:
+        return len(self.centre)
+
+    @property
+    def groups(self) -> int:
+        return len(self.depends)
 
     def log_prob(self, x: Matrix) -> Matrix:
         """Return the log density (first column) and its terms, which emcee keeps as blobs."""
         terms = self.terms(x)
         return np.concatenate([terms.sum(axis=1, keepdims=True), terms], axis=1)
-
-    def laplace(self) -> Transport:
-        """Return the map of the Gaussian approximation."""
-        return gaussian(self.centre, self.covariance, self.group)
-
-    def in_coordinates(self, map: Transport) -> "LogDensity":
-        """Return the same distribution as a density of mapped coordinates u.
-
-        Centre and covariance remain those of x.
-        """
-        count = int(self.group.max()) + 1
-        onto = np.eye(count + 1)[np.where(self.group < 0, count, self.group)]
-
-        def terms(u: Matrix) -> Matrix:
-            x, log = map.placed(u)
-            return np.asarray(self.terms(x) + log @ onto)
-
-        def slope(u: Matrix) -> Matrix:
-            return map.pulled_back(u, self.slope)
-
-        return replace(self, terms=terms, slope=slope, map=map)
 
 
 @dataclass(frozen=True)
@@ -80,12 +74,14 @@ class Plan:
         ensembles: number of independent ensembles.
         walkers: number of walkers of each ensemble.
         block: number of steps in a block.
-        warm_up: numbers of blocks after which proposals are learnt; the last number only ends the
-            warm-up, since the step of Hamiltonian moves needs some blocks to adapt to the last
-            proposals.
+        warm_up: numbers of blocks after which the surrogate is learnt anew; the last number only
+            ends the warm-up, since steps of Hamiltonian moves need some blocks to adapt to the
+            last surrogate.
         most: number of blocks after which sampling ends even without convergence.
-        spread: distance of the widest walker's start from the fit [std]; the first walker starts
-            at a quarter of this distance. Wide starts find modes away from the fit.
+        spread: distance from the fit up to which the first surrogate is learnt, and from which
+            trajectories on it start [std]. A large distance finds modes away from the fit.
+        rows: number of exact densities from which the first surrogate is learnt; later ones are
+            learnt from up to three times as many.
         r_hat: upper limit of R-hat over ensembles for every coordinate.
         steps_per_tau: lower limit of steps per autocorrelation time for every coordinate.
         least_draws: lower limit of effective draws for every coordinate.
@@ -95,9 +91,10 @@ class Plan:
     ensembles: int = 4
     walkers: int = 8
     block: int = 20
-    warm_up: tuple[int, ...] = (3, 6, 10, 16, 24, 34, 36)
+    warm_up: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
     most: int = 400
-    spread: float = 4.0
+    spread: float = 2.0
+    rows: int = 1500
     r_hat: float = 1.01
     steps_per_tau: float = 50.0
     least_draws: float = 1000.0
@@ -112,6 +109,24 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False)
+class Learnt:
+    """What Hamiltonian moves follow, and from which it can be learnt anew.
+
+    Attributes:
+        surrogate: surrogate of the log density.
+        step: longest leapfrog step of every family of coordinates (`proposals.families`).
+        design: vectors from whose exact densities the next surrogate is learnt.
+        places: ends of trajectories on the surrogate, from which the walkers of the next block
+            start, so that none remains where the surrogate before was wrong.
+    """
+
+    surrogate: Surrogate
+    step: Float[np.ndarray, " family"]
+    design: Float[np.ndarray, "row size"]
+    places: Float[np.ndarray, "ensemble walker size"]
+
+
+@dataclass(frozen=True, eq=False)
 class ChainBlock:
     """Consecutive steps of all ensembles, with the state from which the next block starts.
 
@@ -122,9 +137,7 @@ class ChainBlock:
         random: state of each ensemble's Mersenne twister after the block: its key, and (position,
             has_gauss, cached Gaussian) as in NumPy.
         accepted: fraction of the moves that changed a coordinate, for each ensemble.
-        map: map to the coordinates of the next block.
-        angle: step of the Hamiltonian moves in the next block, one per family of coordinates
-            (`proposals.families`) [rad].
+        learnt: what was learnt after this block, None if nothing was.
     """
 
     number: int
@@ -132,37 +145,42 @@ class ChainBlock:
     log_prob: Float[np.ndarray, "ensemble step walker"]
     random: tuple[UInt32[np.ndarray, "ensemble 624"], Float[np.ndarray, "ensemble 3"]]
     accepted: Float[np.ndarray, " ensemble"]
-    map: Transport
-    angle: Float[np.ndarray, " family"]
+    learnt: Learnt | None
 
 
 def packed(block: ChainBlock) -> dict[str, np.ndarray]:
     """Return the arrays of a block, keyed by their names in a file."""
-    return {
+    out = {
         "number": np.asarray(block.number),
         "chain": block.chain,
         "log_prob": block.log_prob,
         "random_key": block.random[0],
         "random_rest": block.random[1],
         "accepted": block.accepted,
-        "angle": block.angle,
-        "last": np.stack(list(vars(block.map.last).values())),
-        **{f"map/{name}": np.asarray(getattr(block.map, name)) for name in _MAP_FIELDS},
     }
+    if (learnt := block.learnt) is not None:
+        leaves = jax.tree.leaves(learnt.surrogate)
+        out |= {"groups": np.asarray(len(learnt.surrogate.groups))}
+        out |= {name: getattr(learnt, name) for name in _LEARNT}
+        out |= {f"surrogate/{k:03d}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
+    return out
 
 
 def unpacked(arrays: Mapping[str, np.ndarray]) -> ChainBlock:
     """Return the block from the arrays that `packed` returned."""
-    fields = {name: arrays[f"map/{name}"] for name in _MAP_FIELDS}
+    learnt = None
+    if "groups" in arrays:
+        leaves = [arrays[name] for name in sorted(arrays) if name.startswith("surrogate/")]
+        surrogate = Surrogate.of_leaves(leaves, int(arrays["groups"]))
+        learnt = Learnt(surrogate, **{name: arrays[name] for name in _LEARNT})
     return ChainBlock(
         number=int(arrays["number"]),
         chain=arrays["chain"],
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        map=Transport(last=Warp(*arrays["last"]), **fields),
-        angle=arrays["angle"],
+        learnt=learnt,
     )
 
 
-_MAP_FIELDS = ("mean", "order", "slope", "root", "factors", "shift", "scale")
+_LEARNT = ("step", "design", "places")

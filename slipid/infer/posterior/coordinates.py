@@ -1,12 +1,14 @@
 """Coordinates of a density, and the data and fitted values from which it is computed."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.fitting import likelihood as lk
 from slipid.fitting.problem import Problem, effects_given, twists
@@ -17,6 +19,9 @@ from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
 """Parts of a posterior: motion parameters, electric ones given the motion, all parameters."""
+Rows = TypeVar("Rows")
+OfFloor = TypeVar("OfFloor", SharedEffects, EffectPosterior)
+
 _ROUNDS = 3
 """Number of alternations between weights of runs and shared effects at the fit."""
 
@@ -43,10 +48,22 @@ class Fitted:
         return cls(fit.z, np.log([fit.variance[name] for name in names]), fit.covariance)
 
 
-def coordinates(
-    problem: Problem, fitted: Fitted, part: str
-) -> tuple[Int[np.ndarray, " size"], Int[np.ndarray, " size"]]:
-    """Return search-vector index and group of every coordinate of a part of the posterior.
+class Coordinates(NamedTuple):
+    """Coordinates of a part of the posterior.
+
+    Attributes:
+        structure: index of each coordinate in the search vector.
+        group: index of the only floor whose residuals depend on it, -1 if there are several.
+        touched: True where the residuals of a floor depend on a coordinate.
+    """
+
+    structure: Int[np.ndarray, " size"]
+    group: Int[np.ndarray, " size"]
+    touched: Bool[np.ndarray, "floor size"]
+
+
+def coordinates(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
+    """Return the coordinates of a part of the posterior.
 
     The group is the index of the only floor whose residuals depend on the coordinate, -1 if several
     floors or none depend on it; if the robot has one floor only, all coordinates are in group 0.
@@ -63,7 +80,8 @@ def coordinates(
     electric = problem.space.electric
     mine = {MOTION: ~electric, ELECTRIC: electric, EVERYTHING: np.ones_like(electric)}[part]
     alone = (touched.sum(axis=1) == 1) | (touched.shape[1] == 1)
-    return np.flatnonzero(mine), np.where(alone, touched.argmax(axis=1), -1)[mine]
+    group = np.where(alone, touched.argmax(axis=1), -1)[mine]
+    return Coordinates(np.flatnonzero(mine), group, touched[mine].T)
 
 
 def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.ndarray, "segment 3"]:
@@ -136,6 +154,31 @@ class Anchor(eqx.Module):
             twist=twist,
             twist_slope=slope,
             electric=electric,
+        )
+
+    def on_floor(self, floor: int) -> "Anchor":
+        """Return the part of the anchor that belongs to the runs on one floor."""
+        segments = len(self.batch.surface)
+        mine = np.flatnonzero(np.asarray(self.batch.surface) == floor)
+
+        def rows(tree: Rows) -> Rows:
+            # The lag of the camera and the scatter without currents are common to all segments.
+            return jax.tree.map(lambda x: x[mine] if x.shape[:1] == (segments,) else x, tree)
+
+        def own(of: tuple[OfFloor, ...]) -> tuple[OfFloor, ...]:
+            return tuple(replace(one, segments=jnp.arange(len(mine))) for one in of[floor:][:1])
+
+        return replace(
+            self,
+            batch=rows(self.batch),
+            root=rows(self.root),
+            scale=rows(self.scale),
+            log_det=rows(self.log_det),
+            shared=own(self.shared),
+            effects=own(self.effects),
+            twist=self.twist[mine],
+            twist_slope=self.twist_slope[mine],
+            electric=replace(self.electric, scatter=rows(self.electric.scatter)),
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:

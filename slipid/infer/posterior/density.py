@@ -27,13 +27,13 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from slipid.fitting import likelihood as lk
 from slipid.fitting.problem import Problem
-from slipid.fitting.shared_effects import EffectPosterior, mean_effects
+from slipid.fitting.shared_effects import marginal_residuals, mean_effects
 from slipid.fitting.variances import Square, expected
+from slipid.infer.posterior.blocks import LogDensity
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Fitted, coordinates
 from slipid.model.robot import Robot
 
@@ -50,6 +50,22 @@ class HeldMotion(NamedTuple):
 
     z: Float[Array, "*walker free"]
     motor_force: Float[Array, "*walker segment window wheel 2"]
+
+    def on(self, segments: Int[np.ndarray, " some"]) -> "HeldMotion":
+        """Return the motion of many walkers in some segments only."""
+        return self._replace(motor_force=self.motor_force[:, segments])
+
+
+class WhitenedResiduals(NamedTuple):
+    """Residuals of which a log likelihood is `remainder` - |rows|^2 / 2.
+
+    Attributes:
+        rows: whitened residuals less the shared effects, and the coefficients of these.
+        remainder: log |d residuals / d data| times the factors f.
+    """
+
+    rows: Float[Array, "*walker row"]
+    remainder: Float[Array, "*walker"]
 
 
 class _Residuals(NamedTuple):
@@ -69,6 +85,7 @@ class Density:
         structure: index of each coordinate in the search vector.
         group: index of the only floor whose residuals depend on the coordinate, -1 if there are
             several.
+        touched: True where the residuals of a floor depend on a coordinate (floor, size).
         names: name of each coordinate.
         centre, covariance: mean and covariance of the Laplace approximation.
     """
@@ -76,9 +93,12 @@ class Density:
     def __init__(self, problem: Problem, fitted: Fitted, part: str):
         self.problem, self.part = problem, part
         self.floors = problem.robot.surfaces.labels
-        self.structure, self.group = coordinates(problem, fitted, part)
+        self.structure, self.group, self.touched = coordinates(problem, fitted, part)
         self.names = tuple(problem.space.names[k] for k in self.structure)
         self.anchor = Anchor.at(problem, fitted)
+        floors = np.asarray(problem.batch.surface)
+        self._segments = [np.flatnonzero(floors == k) for k in range(len(self.floors))]
+        self._on_floor = [self.anchor.on_floor(k) for k in range(len(self.floors))]
         # The first density with these coordinates compiles the functions for all later ones.
         form = part, self.names, self.group.tobytes()
         self._each: dict[Callable[..., object], Callable[..., Any]] = {}
@@ -94,11 +114,15 @@ class Density:
         """Return the search vector with the coordinates x of the density and all others fitted."""
         return anchor.z.at[self.structure].set(x)
 
-    def mapped(self, of: Callable[..., Result], *many: Any) -> Result:
+    def mapped(self, of: Callable[..., Result], *many: Any, floor: int | None = None) -> Result:
         """Return the results of a function of (density, anchor, element) for many elements.
 
-        `many` are the arrays of the elements, or None, one for each further argument of the
-        function. The function is compiled once for all densities with the same coordinates.
+        The function is compiled once for all densities with the same coordinates.
+
+        Args:
+            of: the function.
+            many: arrays of the elements, or None, one for each further argument of the function.
+            floor: floor to whose runs the anchor is restricted.
         """
         form = self._form
         if of not in form._each:
@@ -108,8 +132,25 @@ class Density:
 
             # Stored here, since the cache of JAX for compiled functions would never free it.
             form._each[of] = jax.jit(each)
-        found: Result = form._each[of](self.anchor, many)
+        anchor = self.anchor if floor is None else self._on_floor[floor]
+        found: Result = form._each[of](anchor, many)
         return found
+
+    def target(self) -> LogDensity:
+        """Return the density as the sampler needs it."""
+        space, at = self.problem.space, self.structure
+        floors = np.arange(len(self.floors))[:, None]
+        return LogDensity(
+            terms=self.terms,
+            rows=self.rows,
+            depends=self.touched | (self.group == floors),
+            group=self.group,
+            positive=space.where(lambda e: e.declaration.logarithmic)[at],
+            prior_mean=space.prior_mean[at],
+            prior_std=np.asarray(self.anchor.prior_std)[at],
+            centre=self.centre,
+            covariance=self.covariance,
+        )
 
     def terms(
         self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
@@ -118,47 +159,63 @@ class Density:
 
         The electric part needs the motion of each walker, as returned by `hold`.
         """
-        out = np.array(self.mapped(Density.sums, x, held))
+        out = np.zeros((len(x), len(self.floors) + 1))
+        prior = -0.5 * np.asarray(self._pull(self.anchor, x)) ** 2
+        np.add.at(out.T, self.group, prior.T)  # group -1 is the last term
+        for floor in range(len(self.floors)):
+            y, remainder = self.rows(x, floor, held)
+            out[:, floor] += remainder - 0.5 * (y**2).sum(axis=1)
         out[~np.isfinite(out)] = -np.inf
         return out
 
-    def slope(
-        self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
-    ) -> Float[np.ndarray, "walker size"]:
-        """Return the gradient of every walker's log posterior; the arguments are as in `terms`."""
-        return np.array(self.mapped(Density._gradient, x, held))
+    def rows(
+        self,
+        x: Float[np.ndarray, "walker size"],
+        floor: int,
+        held: HeldMotion | None = None,
+    ) -> tuple[Float[np.ndarray, "walker row"], Float[np.ndarray, " walker"]]:
+        """Return whitened residuals y of a floor and the remainder c of its log likelihood.
 
-    def _gradient(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
-        return jax.grad(lambda x: jnp.sum(self.sums(anchor, x, held)))(x)
+        The log likelihood is c - |y|^2 / 2; c depends on the camera's parameters only.
+        """
+        mine = None if held is None else held.on(self._segments[floor])
+        y, c = [], []
+        # Batches of one size only, so that one compiled function serves any number of walkers.
+        for k in range(0, len(x), _BATCH):
+            some = np.minimum(np.arange(k, k + _BATCH), len(x) - 1)
+            of = None if mine is None else jax.tree.map(lambda leaf, at=some: leaf[at], mine)
+            found = self.mapped(Density.whitened, x[some], of, floor=floor)
+            y.append(np.asarray(found.rows)[: len(x) - k])
+            c.append(np.asarray(found.remainder)[: len(x) - k])
+        return np.concatenate(y), np.concatenate(c)
 
-    def sums(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
-        """Return the terms of the log posterior for one vector x."""
-        found, count, b = self._residuals(anchor, x, held), len(self.floors), anchor.batch
-        out = jnp.zeros(count + 1)
+    def log_prob(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
+        """Return the log posterior of one vector x, for all floors of the anchor."""
+        found = self.whitened(anchor, x, held)
+        squares = jnp.sum(found.rows**2) + jnp.sum(self._pull(anchor, x) ** 2)
+        return found.remainder - 0.5 * squares
+
+    def whitened(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> WhitenedResiduals:
+        """Return whitened residuals of one vector, shared effects marginalised."""
+        found, b = self._residuals(anchor, x, held), anchor.batch
         camera, spread = lk.log_jacobians(found.robot, b, anchor.noise(found.robot))
+        rows, remainder = [], jnp.zeros(())
         for k, r in found.residuals.items():
-            white, more = anchor.white(k, r), jnp.zeros(len(r))
-            less = expected(r.shape[-1])  # The factor f makes the mode equal to that of the fit.
+            white = anchor.white(k, r)
+            # The factor f makes the mode equal to that of the fit.
+            f = expected(r.shape[-1])
             if k == "motion":
-                more = less * camera
-                for floor, posterior in enumerate(anchor.effects):
-                    out = out.at[floor].add(0.5 * _explained(posterior, white))
-            elif k == "voltage":
-                more = less * spread
-            out = out.at[b.surface].add(more - 0.5 * jnp.sum(white**2, axis=1))
-        pull = self._pull(anchor, x)
-        return out.at[np.where(self.group < 0, count, self.group)].add(-0.5 * pull**2)
+                rows.append(marginal_residuals(anchor.effects, white))
+                remainder += f * jnp.sum(camera)
+            else:
+                rows.append(white.ravel())
+                remainder += f * jnp.sum(spread) if k == "voltage" else 0.0
+        return WhitenedResiduals(jnp.concatenate(rows), remainder)
 
-    def _pull(self, anchor: Anchor, x: Array) -> Float[Array, " size"]:
-        """Return the residuals of the prior for one vector x [prior std]."""
+    def _pull(self, anchor: Anchor, x: Array | np.ndarray) -> Float[Array, "*walker size"]:
+        """Return the residuals of the prior [prior std]."""
         at = self.structure
         return (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]
-
-    def whitened(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
-        """Return whitened residuals of data and prior of the electric part, for one vector."""
-        found = self._residuals(anchor, x, held).residuals
-        data = [anchor.white(k, r).ravel() for k, r in found.items()]
-        return jnp.concatenate([*data, self._pull(anchor, x)])
 
     def log_likelihoods(
         self, anchor: Anchor, x: Array, held: HeldMotion | None
@@ -217,13 +274,8 @@ class Density:
         return HeldMotion(z, anchor.predict(self.problem.space.tree(z), z).motor_force)
 
 
-def _explained(posterior: EffectPosterior, white: Float[Array, "segment m"]) -> Array:
-    """Return the reduction of the sum of squared residuals by a floor's shared effects."""
-    projected = jnp.einsum("nma,nm->an", posterior.span, white[posterior.segments])
-    along = jnp.einsum("anq,an->aq", posterior.root, projected).ravel()
-    return jnp.sum(solve_triangular(posterior.factor, along, lower=True) ** 2)
-
-
+_BATCH = 4
+"""Number of vectors that are evaluated together."""
 _STEPS, _PROPOSALS = 4, 16
 """Numbers of Gauss-Newton steps and of proposals for every draw of the motion."""
 _DEGREES = 5.0
@@ -276,11 +328,11 @@ def _draw(
     """
 
     def log_prob(x: Array) -> Array:
-        return jnp.sum(density.sums(anchor, x, held))
+        return density.log_prob(anchor, x, held)
 
     def information(x: Array) -> Array:
-        slope = jax.jacfwd(lambda x: density.whitened(anchor, x, held))(x)
-        return slope.T @ slope
+        slope = jax.jacfwd(lambda x: density.whitened(anchor, x, held).rows)(x)
+        return slope.T @ slope + jnp.diag(1 / anchor.prior_std[density.structure] ** 2)
 
     def step(x: Array, _: None) -> tuple[Array, None]:
         return x + jnp.linalg.solve(information(x), jax.grad(log_prob)(x)), None

@@ -24,7 +24,7 @@ from slipid.fitting.hierarchy import axis_effects, effect_information, pooled_st
 from slipid.fitting.problem import Problem, linear
 from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD, information
 from slipid.infer.posterior import diagnosis, ensemble
-from slipid.infer.posterior.blocks import Chain, ChainBlock, LogDensity, Plan
+from slipid.infer.posterior.blocks import Chain, ChainBlock, Plan
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, effects_at
 from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.infer.posterior.diagnosis import Posterior
@@ -49,8 +49,7 @@ def sampled(
     assert problem.multi_floor is None, "sampling needs a fit of runs on one floor each"
     parts = (EVERYTHING,) if problem.objective.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
-    target = LogDensity(first.terms, first.slope, first.group, first.centre, first.covariance)
-    blocks = ensemble.extended(target, plan, parts[0], checkpoint, report)
+    blocks = ensemble.extended(first.target(), plan, parts[0], checkpoint, report)
     chain = ensemble.chain(blocks, plan)
     found = diagnosis.diagnose(chain, plan)
     x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)

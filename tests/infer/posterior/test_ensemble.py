@@ -7,127 +7,127 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from emcee.model import Model
-
 from slipid.infer.posterior.blocks import LogDensity, Plan
 from slipid.infer.posterior.diagnosis import autocorrelation_time, diagnose
 from slipid.infer.posterior.ensemble import chain as positions
 from slipid.infer.posterior.ensemble import extended
-from slipid.infer.posterior.proposals import (
-    CoordinateWalk,
-    DifferentialEvolution,
-    Hamiltonian,
-    Independence,
-    families,
-)
+from slipid.infer.posterior.proposals import DifferentialEvolution, families
 from slipid.support.progress import Reporter
 from tests.helpers.memory import holding
 
-PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(2, 4, 6), most=120, spread=6.0)
+PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(1, 2, 3, 5), most=120, spread=6.0, rows=300)
 
 
-def known(terms, group, centre, covariance):
-    """Return a target with slopes by central differences."""
+def known(residuals, group, centre, covariance, prior=None, positive=()):
+    """Return a target from a function of (vectors, group) that returns residuals and remainder.
 
-    def slope(x):
-        step = 1e-5 * np.eye(x.shape[1])
-        ends = x + np.stack([step, -step])[:, :, None]  # all at once: calls take longer than sums
-        above, below = (
-            terms(ends.reshape(-1, x.shape[1])).sum(axis=1).reshape(2, x.shape[1], len(x))
-        )
-        return (above - below).T / 2e-5
+    `prior` holds the mean and the std of every coordinate, infinite where there is none.
+    """
+    size, groups = len(group), int(group.max()) + 1
+    mean, std = prior or (np.zeros(size), np.full(size, np.inf))
 
-    return LogDensity(terms, slope, group, centre, covariance)
+    def terms(x):
+        out = np.zeros((len(x), groups + 1))
+        np.add.at(out.T, group, -0.5 * (((x - mean) / std) ** 2).T)
+        for g in range(groups):
+            y, c = residuals(x, g)
+            out[:, g] += c - 0.5 * (y**2).sum(axis=1)
+        return out
+
+    depends = (group == np.arange(groups)[:, None]) | (group < 0)
+    of_positive = np.isin(np.arange(size), positive)
+    return LogDensity(terms, residuals, depends, group, of_positive, mean, std, centre, covariance)
 
 
 def gaussian():
     """Two groups of three and two shared numbers, strongly correlated; Laplace is a little off."""
     rng = np.random.default_rng(0)
     group = np.array([-1, 0, 0, 0, -1, 1, 1, 1])
-    slope = rng.normal(size=(2, 8))
+    shared, mean = group < 0, rng.normal(size=8)
     spread = np.array([1.0, 0.1, 2.0, 5.0, 0.3, 1.0, 0.02, 1.0])
-    shared = group < 0
-    mixing = np.eye(8)
-    for k in np.flatnonzero(~shared):
-        mixing[k, shared] = slope[:, k]
-    for k in (2, 3, 6, 7):
-        mixing[k, k - 1] = 0.9
-    root = spread[:, None] * mixing
-    mean = rng.normal(size=8)
+    slope = rng.normal(size=(8, 2)) * spread[:, None] / spread[shared]
+    inner = np.array([[1.0, 0, 0], [0.9, 1, 0], [0, 0.9, 1]])
+    root = np.diag(spread)
+    for g in (0, 1):
+        own = group == g
+        root[np.ix_(own, shared)] = slope[own] * spread[shared]
+        root[np.ix_(own, own)] = spread[own][:, None] * inner
+
+    def residuals(x, g):
+        d, own = x - mean, group == g
+        rest = d[:, own] - d[:, shared] @ slope[own].T
+        y = np.linalg.solve(spread[own][:, None] * inner, rest.T).T
+        return y, np.zeros(len(x))
+
     covariance = root @ root.T
-    precision = np.linalg.inv(covariance)
-
-    def terms(x):
-        # the precision has no entries between groups: each group's own rows, and the remainder
-        d = x - mean
-        out = np.zeros((len(x), 3))
-        for g in (0, 1):
-            own = group == g
-            inner = np.where(np.outer(own, own), precision, 0.0)
-            cross = np.where(np.outer(own, shared), precision, 0.0)
-            out[:, g] = -0.5 * np.einsum("ni,ij,nj->n", d, inner + 2 * cross, d)
-        rest = np.where(np.outer(shared, shared), precision, 0.0)
-        out[:, 2] = -0.5 * np.einsum("ni,ij,nj->n", d, rest, d)
-        return out
-
-    assert np.abs(precision[np.ix_(group == 0, group == 1)]).max() < 1e-9
+    prior = np.where(shared, mean, 0.0), np.where(shared, spread, np.inf)
     off = mean + 0.7 * np.sqrt(np.diag(covariance))
-    return known(terms, group, off, 0.6 * covariance), mean, np.sqrt(np.diag(covariance))
+    target = known(residuals, group, off, 0.6 * covariance, prior)
+    return target, mean, np.sqrt(np.diag(covariance))
 
 
 def banana():
-    def terms(x):
-        bent = -0.5 * x[:, 0] ** 2 - 2.0 * (x[:, 1] - x[:, 0] ** 2) ** 2
-        return np.stack([bent, 0 * bent], axis=1)
+    def residuals(x, _):
+        y = np.stack([x[:, 0], 2 * (x[:, 1] - x[:, 0] ** 2)], axis=1)
+        return y, np.zeros(len(x))
 
-    target = known(terms, np.zeros(2, int), np.zeros(2), np.diag([1.0, 0.25]))
+    target = known(residuals, np.zeros(2, int), np.zeros(2), np.diag([1.0, 0.25]))
     return target, np.array([0.0, 1.0]), np.array([1.0, 1.5])
 
 
 def funnel():
     """Width e^v/2 of three numbers, v shared."""
 
-    def terms(x):
+    def residuals(x, g):
         v = x[:, 0]
-        own = -0.5 * (x[:, 1:] ** 2 * np.exp(-v)[:, None] + v[:, None])
-        return np.concatenate([own, -0.5 * v[:, None] ** 2], axis=1)
+        return x[:, [g + 1]] * np.exp(-0.5 * v)[:, None], -0.5 * v
 
-    target = known(terms, np.array([-1, 0, 1, 2]), np.zeros(4), np.eye(4))
+    group = np.array([-1, 0, 1, 2])
+    prior = np.zeros(4), np.where(group < 0, 1.0, np.inf)
+    target = known(residuals, group, np.zeros(4), np.eye(4), prior, positive=[0])
     return target, np.zeros(4), np.array([1.0, *[np.exp(0.25)] * 3])
+
+
+def mixture(log_density, centre):
+    """Return a target whose first number has a given log density, with one more beside it."""
+
+    def residuals(x, _):
+        y = np.sqrt(np.maximum(-2 * log_density(x[:, 0]), 0.0))
+        return np.stack([y, x[:, 1]], axis=1), np.zeros(len(x))
+
+    return known(residuals, np.zeros(2, int), np.array([centre, 0.0]), np.eye(2))
 
 
 def two_modes():
     """Return modes with weights 0.3 and 0.7 at -4 and 4, with Laplace at the first only."""
 
-    def terms(x):
-        d = np.logaddexp(
-            np.log(0.3) - 0.5 * (x[:, 0] + 4) ** 2, np.log(0.7) - 0.5 * (x[:, 0] - 4) ** 2
-        )
-        return np.stack([d - 0.5 * x[:, 1] ** 2, 0 * d], axis=1)
+    def log_density(x):
+        return np.logaddexp(np.log(0.3) - 0.5 * (x + 4) ** 2, np.log(0.7) - 0.5 * (x - 4) ** 2)
 
-    target = known(terms, np.zeros(2, int), np.array([-4.0, 0.0]), np.eye(2))
-    return target, np.array([1.6, 0.0]), np.array([np.sqrt(1 + 16 * 4 * 0.3 * 0.7), 1.0])
+    std = np.array([np.sqrt(1 + 16 * 4 * 0.3 * 0.7), 1.0])
+    return mixture(log_density, -4.0), np.array([1.6, 0.0]), std
 
 
 def plateau():
     """Return a density of the log of a number that is only known to be small, and of another."""
 
-    def below(x):
-        return -0.5 * ((x + 1) / 2) ** 2 - 0.5 * ((np.exp(x) - 1) / 0.4) ** 2
-
-    def terms(x):
+    def residuals(x, _):
         with np.errstate(over="ignore"):
-            own = below(x[:, 0]) - 0.5 * ((x[:, 1] - 1 + 3 * np.exp(x[:, 0])) / 0.1) ** 2
-        return np.stack([own, np.zeros(len(own))], axis=1)
+            p = np.exp(x[:, 0])
+        y = np.stack([(p - 1) / 0.4, (x[:, 1] - 1 + 3 * p) / 0.1], axis=1)
+        return y, np.zeros(len(x))
 
     grid = np.linspace(-12, 3, 20001)
-    weight = np.exp(below(grid))
+    weight = np.exp(-0.5 * ((grid + 1) / 2) ** 2 - 0.5 * ((np.exp(grid) - 1) / 0.4) ** 2)
     weight /= weight.sum()
     about = np.stack([grid, 1 - 3 * np.exp(grid)])
     mean = about @ weight
     var = (about - mean[:, None]) ** 2 @ weight + np.array([0.0, 0.01])
     covariance = np.array([[0.16, -0.48], [-0.48, 1.45]])
-    return known(terms, np.zeros(2, int), np.array([0.0, -2.0]), covariance), mean, np.sqrt(var)
+    prior = np.array([-1.0, 0.0]), np.array([2.0, np.inf])
+    centre = np.array([0.0, -2.0])
+    target = known(residuals, np.zeros(2, int), centre, covariance, prior, positive=[0])
+    return target, mean, np.sqrt(var)
 
 
 def run(target, plan, done=()):
@@ -175,12 +175,11 @@ def test_moments_are_within_three_monte_carlo_errors_unless_convergence_is_denie
 def test_ensembles_in_different_modes_are_not_reported():
     """No move leads between modes that are so far apart."""
 
-    def terms(x):
-        d = np.logaddexp(-0.5 * (x[:, 0] + 50) ** 2, -0.5 * (x[:, 0] - 50) ** 2)
-        return np.stack([d, 0 * d], axis=1)
+    def log_density(x):
+        return np.logaddexp(-0.5 * (x + 50) ** 2, -0.5 * (x - 50) ** 2)
 
-    target = known(terms, np.zeros(1, int), np.zeros(1), np.eye(1))
-    plan = Plan(ensembles=4, walkers=4, block=25, warm_up=(2,), most=12, spread=30.0)
+    target = mixture(log_density, 0.0)
+    plan = Plan(ensembles=4, walkers=4, block=25, warm_up=(1, 2), most=12, spread=30.0, rows=300)
     _, chain, found = sampled(target, plan)
     assert {-1, 1} == set(np.sign(chain[:, -1, 0, 0]).astype(int)) or not found.converged
     if len(set(np.sign(chain[..., 0]).mean(axis=(1, 2)).round(3))) > 1:
@@ -190,7 +189,7 @@ def test_ensembles_in_different_modes_are_not_reported():
 @pytest.mark.slow
 def test_an_interrupted_chain_continues_like_an_uninterrupted_one():
     target, _, _ = gaussian()
-    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=6)
+    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2, 3), most=6, rows=200)
     whole = run(target, plan)
     for stop in range(1, 6):
         again = run(target, plan, whole[:stop])
@@ -202,7 +201,7 @@ def test_an_interrupted_chain_continues_like_an_uninterrupted_one():
 @pytest.mark.slow
 def test_the_seed_decides():
     target, _, _ = banana()
-    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1,), most=3)
+    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1,), most=3, rows=200)
     one, same = (np.concatenate([b.chain for b in run(target, plan)]) for _ in range(2))
     other = np.concatenate([b.chain for b in run(target, replace(plan, seed=1))])
     np.testing.assert_array_equal(one, same)
@@ -210,142 +209,10 @@ def test_the_seed_decides():
     assert not np.array_equal(one[0], one[1])  # ensembles differ
 
 
-@pytest.fixture(scope="module")
-def exact():
-    """Return a Gaussian in the coordinates of the Laplace map, and draws of it."""
-    target, mean, _ = gaussian()
-    target = replace(target, centre=mean, covariance=target.covariance / 0.6)
-    u = np.random.RandomState(1).standard_normal((4000, 8))
-    return target.in_coordinates(target.laplace()), u
-
-
-def test_independence_accepts_nearly_everything_where_laplace_is_exact(exact):
-    """All moves are accepted but for the tails of the Student t; groups follow shared numbers."""
-    target, u = exact
-    before, random = target.terms(u), np.random.RandomState(0)
-    assert len(families(target)) == 2
-    for family in families(target):
-        new, factor = Independence(family).proposed(u, u, random)
-        gain = target.terms(new) - before
-        gain = gain.sum(1)[:, None] if family.groups is None else gain[:, list(family.groups)]
-        assert np.minimum(1, np.exp(gain + factor)).mean() > 0.85
-        others = np.setdiff1d(np.arange(8), np.concatenate(family.places))
-        np.testing.assert_array_equal(new[:, others], u[:, others])
-
-
-def made_gaussian(map, group):
-    """Return a target that is a standard Gaussian in the coordinates of a map."""
-    onto = np.eye(3)[np.where(group < 0, 2, group)]
-
-    def terms(u):
-        return -0.5 * u**2 @ onto
-
-    centre, covariance = np.zeros(len(group)), np.eye(len(group))
-    return LogDensity(terms, np.negative, group, centre, covariance, map=map)
-
-
-def model_of(target):
-    """Model with the attributes that emcee gives to moves."""
-
-    def compute(u):
-        out = target.log_prob(u)
-        return out[:, 0], out[:, 1:]
-
-    return Model(target.log_prob, compute, map, np.random.RandomState(0))
-
-
-def state_of(target, u):
-    """Return the state of walkers, and the model that emcee gives to moves."""
-    from emcee.state import State
-
-    model = model_of(target)
-    log_prob, terms = model.compute_log_prob_fn(u)
-    return model, State(u, log_prob=log_prob, blobs=terms, copy=True)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("which", [0, 1])
-def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact, which):
-    target, u = exact
-    model, state = state_of(target, u)
-    family = families(target)[which]
-    move = Hamiltonian(target, family, 0.5)
-    state, _ = move.propose(model, state)
-    assert move.accepted[0] > 0.999  # there is no error to reject for
-    np.testing.assert_allclose(state.log_prob, target.terms(state.coords).sum(axis=1), rtol=1e-9)
-    own = np.concatenate(family.places)
-    together = np.mean(u * state.coords, axis=0)
-    assert np.abs(together[own]).max() < 0.7  # part of a quarter turn
-    others = np.setdiff1d(np.arange(8), own)
-    np.testing.assert_array_equal(state.coords[:, others], u[:, others])
-
-
-def two_widths():
-    """Two groups of two numbers: one far from a standard Gaussian, one near it."""
-    precision = np.array([1.0, 6.0, 1.2, 1.0, 1.0])
-    group = np.array([0, 0, 1, 1, -1])
-
-    def terms(x):
-        each = -0.5 * precision * x**2
-        return np.stack([each[:, group == g].sum(axis=1) for g in (0, 1, -1)], axis=1)
-
-    target = LogDensity(terms, lambda x: -precision * x, group, np.zeros(5), np.eye(5))
-    return target.in_coordinates(target.laplace()), precision
-
-
-@pytest.mark.slow
-def test_each_group_has_its_own_hamiltonian_trajectory():
-    """Steps too long for one group are refused for that group only, and both stay exact."""
-    target, precision = two_widths()
-    u = np.random.RandomState(1).standard_normal((4000, 5)) / np.sqrt(precision)
-    model, state = state_of(target, u)
-    move, moved = Hamiltonian(target, families(target)[0], 1.0), []
-    for _ in range(6):
-        before = state.coords.copy()
-        state, _ = move.propose(model, state)
-        moved.append((state.coords != before).mean(axis=0))
-    moved = np.mean(moved, axis=0)
-    assert moved[1] < 0.8
-    assert moved[2] > 0.95
-    np.testing.assert_allclose(state.coords.std(axis=0) * np.sqrt(precision), 1.0, atol=0.05)
-
-
-def test_a_walker_whose_slope_is_lost_stays_with_all_its_groups():
-    target, _ = two_widths()
-    lost = replace(target, slope=lambda x: np.where(x[:, :1] > 1, np.nan, target.slope(x)))
-    u = np.zeros((200, 5))
-    u[:100, 0] = 1.5
-    model, state = state_of(target, u)
-    state, _ = Hamiltonian(lost, families(target)[0], 0.1).propose(model, state)
-    moved = (state.coords != u).any(axis=1)
-    assert moved[100:].mean() > 0.7
-    assert moved[:100].mean() == 0  # they are refused, wherever the trajectory ended
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("groups", [(0, 1), None])
-def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
-    """Exact draws of a Gaussian seen through a curved map stay exact."""
-    map, _ = bent
-    target = made_gaussian(map, np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]))
-    model, u = model_of(target), np.random.RandomState(1).standard_normal((4000, 9))
-    _, state = state_of(target, u)
-    moved = 0.0
-    move = CoordinateWalk(target, groups)
-    for _ in range(8):
-        state, took = move.propose(model, state)
-        moved += took.mean() / 8
-    assert moved > 0.15
-    np.testing.assert_allclose(state.coords.mean(axis=0), 0.0, atol=0.08)
-    np.testing.assert_allclose(state.coords.std(axis=0), 1.0, atol=0.05)
-    np.testing.assert_allclose(np.corrcoef(state.coords.T), np.eye(9), atol=0.08)
-    np.testing.assert_allclose(state.log_prob, target.terms(state.coords).sum(axis=1), atol=1e-9)
-
-
 def test_whole_differences_lead_from_mode_to_mode():
     target, _, _ = two_modes()
     (family,) = families(target)
-    move, random = DifferentialEvolution(family), np.random.RandomState(0)
+    move, random = DifferentialEvolution(target, family), np.random.RandomState(0)
     still = np.concatenate([np.full((20, 2), -4.0), np.full((20, 2), 4.0)])
     x = np.full((4000, 2), -4.0)
     new, factor = move.proposed(x, still, random)

@@ -1,0 +1,148 @@
+"""Learning of the surrogate that Hamiltonian moves follow, in turns during the warm-up.
+
+In every turn the surrogate is fitted to exact rows, and Hamiltonian trajectories on it then give
+vectors whose exact rows are added for the next turn. Where a surrogate claims a density that is not
+there, its trajectories go there and the next one is corrected.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from slipid.infer.posterior.blocks import Chain, Learnt, LogDensity, Plan
+from slipid.infer.posterior.proposals import families, wander
+from slipid.infer.posterior.surrogate import (
+    GroupSurrogate,
+    Matrix,
+    Rows,
+    Surrogate,
+    gaussian_root,
+    group_surrogate,
+)
+
+TARGET_FOLLOWED = 0.8
+"""Target fraction of trajectories that the surrogate accepts, to which their step is adapted."""
+FIRST_STEP, LEAST_STEP, MOST_STEP = 0.1, 0.02, 0.6
+"""First, smallest and largest leapfrog step, in standard coordinates."""
+ROUNDS = 3
+"""Number of times that step and Gaussian are adapted to a new surrogate."""
+KEPT_TURNS = 4
+"""The surrogate is fitted to at most this many times `Plan.rows` rows, the latest ones."""
+FROM_CHAIN = 1 / 3
+"""Largest fraction of new rows that are positions of the chain."""
+NEAR, WIDE_SHARE = (0.05, 1.2), 0.15
+"""Range of the squared scale of the first rows [std^2], and fraction of rows with other scales."""
+CHUNK = 20
+"""Number of vectors whose rows are evaluated and stored together."""
+LAPLACE_WEIGHT = 1e-3
+"""Weight of the Laplace covariance that is added to the covariance of draws."""
+
+
+class Learner:
+    """Learns surrogates of a target, and keeps the exact rows that it has evaluated.
+
+    Attributes:
+        target: the log density.
+        plan: settings of the sampler.
+    """
+
+    def __init__(self, target: LogDensity, plan: Plan):
+        self.target, self.plan = target, plan
+        self._kept: dict[bytes, list[Rows]] = {}
+
+    def first(self) -> Learnt:
+        """Return the surrogate learnt around the Laplace approximation.
+
+        Most rows are where it is plausible, others further away, where there may be other modes.
+        """
+        target, random = self.target, np.random.default_rng((self.plan.seed, 1, 0))
+        root, rows = gaussian_root(target.covariance, target.group), _whole(self.plan.rows)
+        wide = random.uniform(size=rows) < WIDE_SHARE
+        near, far = np.sqrt(random.uniform(*NEAR, rows)), random.uniform(0, self.plan.spread, rows)
+        standard = random.standard_normal((rows, target.size))
+        design = target.centre + np.where(wide, far, near)[:, None] * standard @ root.T
+        shape = self.plan.ensembles, self.plan.walkers
+        scale = self.plan.spread * np.geomspace(0.25, 1.0, shape[1])[:, None]
+        start = target.centre + scale * random.standard_normal((*shape, target.size)) @ root.T
+        steps = np.full(len(families(target)), FIRST_STEP)
+        return self._turn(design, start, (target.centre, root), steps, random)
+
+    def next(self, known: Learnt, chain: Chain, number: int) -> Learnt:
+        """Return the surrogate learnt from that before and new positions of the chain.
+
+        `number` is the number of the block after which the surrogate is learnt.
+        """
+        random = np.random.default_rng((self.plan.seed, 1, number))
+        places = chain.reshape(-1, self.target.size)
+        count = _whole(min(int(FROM_CHAIN * self.plan.rows), len(places)))
+        some = places[random.choice(len(places), count, replace=False)]
+        design = np.concatenate([known.design, some])[-_whole(KEPT_TURNS * self.plan.rows) :]
+        frame = known.surrogate.centre, known.surrogate.root
+        return self._turn(design, chain[:, -1], frame, known.step, random)
+
+    def _turn(
+        self,
+        design: Matrix,
+        start: Float[np.ndarray, "ensemble walker size"],
+        frame: tuple[Float[np.ndarray, " size"], Matrix],
+        step: Float[np.ndarray, " family"],
+        random: np.random.Generator,
+    ) -> Learnt:
+        """Return the surrogate fitted to a design, to which draws of the surrogate are added."""
+        target, plan = self.target, self.plan
+        surrogate = Surrogate(
+            self._fitted(design), target.group, target.prior_mean, target.prior_std, *frame
+        )
+        x, step, drawn = start, step.copy(), []
+        calls = -(-plan.rows // (ROUNDS * plan.ensembles * plan.walkers))
+        of_family = families(target)
+        with ThreadPoolExecutor(min(os.cpu_count() or 1, plan.ensembles)) as pool:
+            for _ in range(ROUNDS):
+                # all coordinates last, whose draws spread furthest
+                turns = [k for k in range(1, len(of_family)) for _ in range(max(2, calls // 4))]
+                for k in [*turns, *[0] * calls]:
+                    keys = jax.random.split(jax.random.key(random.integers(2**31)), len(x))
+                    ends = partial(wander, surrogate, family=of_family[k], step=float(step[k]))
+                    found = list(pool.map(lambda x, key, ends=ends: ends(x=x, key=key), x, keys))
+                    x = np.stack([np.asarray(f.x) for f in found])
+                    drawn.append(x.reshape(-1, target.size))
+                    off = np.mean([float(f.followed) for f in found]) - TARGET_FOLLOWED
+                    step[k] = np.clip(step[k] * np.exp(0.5 * off), LEAST_STEP, MOST_STEP)
+                last = np.concatenate(drawn[-calls:])
+                spread = np.cov(last.T) + LAPLACE_WEIGHT * target.covariance
+                root = gaussian_root(np.atleast_2d(spread), target.group)
+                surrogate = surrogate._replace(centre=last.mean(axis=0), root=root)
+        more = np.concatenate(drawn)
+        count = _whole(min(plan.rows, len(more)))
+        more = more[random.choice(len(more), count, replace=False)]
+        return Learnt(surrogate, step, np.concatenate([design, more]), x)
+
+    def _fitted(self, design: Matrix) -> tuple[GroupSurrogate, ...]:
+        """Return the surrogate of every group, fitted to the exact rows of a design."""
+        target = self.target
+        chunks = np.split(design, len(design) // CHUNK)
+        new = {c.tobytes(): c for c in chunks if c.tobytes() not in self._kept}
+
+        def evaluated(x: Matrix) -> list[Rows]:
+            return [Rows(x, *target.rows(x, g)) for g in range(target.groups)]
+
+        def fitted(g: int) -> GroupSurrogate:
+            parts = zip(*(rows[g] for rows in self._kept.values()), strict=True)
+            rows = Rows(*(np.concatenate(part) for part in parts))
+            at = np.flatnonzero(target.depends[g])
+            return group_surrogate(rows, at, target.positive, int((target.group == g).sum()))
+
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            found = dict(zip(new, pool.map(evaluated, new.values()), strict=True))
+            known = self._kept | found
+            self._kept = {c.tobytes(): known[c.tobytes()] for c in chunks}
+            return tuple(pool.map(fitted, range(target.groups)))
+
+
+def _whole(count: int) -> int:
+    """Return the largest number of vectors up to `count` that fill whole chunks."""
+    return count - count % CHUNK

@@ -1,0 +1,146 @@
+"""Surrogates are right where they can be, and moves that follow wrong ones are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from emcee.model import Model
+from emcee.state import State
+
+from slipid.infer.posterior.blocks import ChainBlock, Learnt, Plan, packed, unpacked
+from slipid.infer.posterior.learning import Learner
+from slipid.infer.posterior.proposals import (
+    CoordinateWalk,
+    DifferentialEvolution,
+    Hamiltonian,
+    families,
+)
+from slipid.infer.posterior.surrogate import gaussian_root
+from tests.infer.posterior.test_ensemble import gaussian, plateau
+
+pytestmark = pytest.mark.slow
+PLAN = Plan(ensembles=4, walkers=16, rows=300, spread=1.0)  # shapes of test_ensemble.py
+COPIES = 4000
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """Return a Gaussian, what was learnt of it, and draws of it."""
+    target, mean, _ = gaussian()
+    root = gaussian_root(target.covariance / 0.6, target.group)
+    x = mean + np.random.RandomState(1).standard_normal((COPIES, 8)) @ root.T
+    return target, Learner(target, PLAN).first(), x, (mean, root)
+
+
+def state_of(target, x):
+    """Return the model that emcee gives to moves, and the state of walkers."""
+
+    def compute(x):
+        out = target.log_prob(x)
+        return out[:, 0], out[:, 1:]
+
+    model = Model(target.log_prob, compute, map, np.random.RandomState(0))
+    log_prob, terms = compute(x)
+    return model, State(x, log_prob=log_prob, blobs=terms, copy=True)
+
+
+def test_a_surrogate_of_linear_residuals_is_exact(exact):
+    target, learnt, x, (mean, _) = exact
+    near = mean + 0.5 * (x[:16] - mean)  # inside the range of plausible rows
+    found = np.asarray(learnt.surrogate.with_slope(jnp.asarray(near)).value)
+    off = found - target.terms(near)
+    np.testing.assert_allclose(off - off[0], 0.0, atol=2e-3)
+
+
+def test_a_root_has_the_covariance_of_groups_that_are_independent_given_what_they_share(exact):
+    target, *_, (_, root) = exact
+    np.testing.assert_allclose(root @ root.T, target.covariance / 0.6, rtol=1e-9, atol=1e-12)
+    one, other = target.group == 0, target.group == 1
+    assert (root[np.ix_(one, other)] == 0).all()
+    assert (root[np.ix_(target.group < 0, ~(target.group < 0))] == 0).all()
+
+
+def test_slopes_are_those_of_the_values():
+    target, _, _ = plateau()
+    surrogate = Learner(target, PLAN).first().surrogate
+    x = target.centre + 0.3 * np.random.default_rng(0).standard_normal((16, 2))
+    x[0] += 30.0  # outside the range of plausible rows
+
+    def value(x):
+        return np.asarray(surrogate.with_slope(jnp.asarray(x)).value).sum(axis=1)
+
+    step = 1e-2 * np.eye(2)
+    numeric = np.stack([(value(x + s) - value(x - s)) / 2e-2 for s in step], axis=1)
+    slope = np.asarray(surrogate.with_slope(jnp.asarray(x)).slope)
+    np.testing.assert_allclose(slope, numeric, rtol=0.02, atol=0.3)
+    assert value(x)[0] < value(x)[1:].min() - 1e4
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_hamiltonian_move_is_accepted_where_the_surrogate_is_exact(exact, which):
+    target, learnt, x, _ = exact
+    family = families(target)[which]
+    model, state = state_of(target, x[:16])
+    move = Hamiltonian(target, family, learnt.surrogate, float(learnt.step[which]))
+    state, _ = move.propose(model, state)
+    assert move.accepted[0] > 0.99
+    np.testing.assert_allclose(state.log_prob, target.terms(state.coords).sum(axis=1), rtol=1e-9)
+    same = (state.coords == x[:16]).all(axis=0)
+    np.testing.assert_array_equal(same, family.block < 0)
+
+
+@pytest.mark.parametrize("kind", [Hamiltonian, CoordinateWalk, DifferentialEvolution])
+@pytest.mark.parametrize("which", [0, 1])
+def test_moves_keep_the_distribution_though_the_surrogate_is_wrong(exact, kind, which):
+    """Draws of a Gaussian stay draws of it, though the surrogate's centre and width are off."""
+    target, learnt, x, (mean, root) = exact
+    wrong = learnt.surrogate._replace(
+        prior_mean=learnt.surrogate.prior_mean + 0.5,
+        groups=tuple(
+            g._replace(constant=g.constant + 0.4, linear=1.2 * g.linear)
+            for g in learnt.surrogate.groups
+        ),
+    )
+    more = {
+        Hamiltonian: (wrong, float(learnt.step[which])),
+        CoordinateWalk: (wrong,),
+        DifferentialEvolution: (),
+    }[kind]
+    family = families(target)[which]
+    model, state = state_of(target, x)
+    move = kind(target, family, *more)
+    for _ in range(6):
+        state, _ = move.propose(model, state)
+    assert 0.02 < np.mean(move.accepted) < 0.97
+    standard = np.linalg.solve(root, (state.coords - mean).T).T
+    np.testing.assert_allclose(standard.mean(axis=0), 0.0, atol=4 / np.sqrt(COPIES))
+    np.testing.assert_allclose(standard.std(axis=0), 1.0, atol=3 / np.sqrt(COPIES))
+    assert (state.coords != x).any(axis=0)[family.block >= 0].all()
+
+
+def test_each_group_is_accepted_by_its_own_term(exact):
+    target, learnt, x, _ = exact
+    groups = learnt.surrogate.groups
+    wrong = learnt.surrogate._replace(
+        groups=(groups[0], groups[1]._replace(constant=groups[1].constant + 3.0))
+    )
+    model, state = state_of(target, x)
+    move = Hamiltonian(target, families(target)[1], wrong, 0.3)
+    moved = move.propose(model, state)[0].coords != x
+    assert moved[:, target.group == 0].mean() > 0.97
+    assert moved[:, target.group == 1].mean() < 0.6
+
+
+def test_blocks_are_stored_with_what_was_learnt(exact):
+    _, learnt, x, _ = exact
+    random = np.zeros((4, 624), np.uint32), np.zeros((4, 3))
+    plain = ChainBlock(3, x[:64].reshape(4, 1, 16, 8), np.zeros((4, 1, 16)), random, x[0, :4], None)
+    assert unpacked(packed(plain)).learnt is None
+    again = unpacked(packed(replace(plain, learnt=learnt))).learnt
+    assert isinstance(again, Learnt)
+    values = (of.surrogate.with_slope(jnp.asarray(x[:16])).value for of in (again, learnt))
+    np.testing.assert_array_equal(*values)
+    np.testing.assert_array_equal(again.places, learnt.places)
