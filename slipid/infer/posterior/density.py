@@ -160,19 +160,6 @@ class Density:
         data = [anchor.white(k, r).ravel() for k, r in found.items()]
         return jnp.concatenate([*data, self._pull(anchor, x)])
 
-    def log_likelihoods(
-        self, anchor: Anchor, x: Array, held: HeldMotion | None
-    ) -> dict[str, Array]:
-        """Return log likelihoods of every segment given the shared effects, by residual block."""
-        rest, robot = self.without_effects(anchor, x, held)
-        out = {k: anchor.log_student(k, r) for k, r in rest.items()}
-        camera, spread = lk.log_jacobians(robot, anchor.batch, anchor.noise(robot))
-        if "motion" in out:
-            out["motion"] += camera
-        if "voltage" in out:
-            out["voltage"] += spread
-        return out
-
     def residual_blocks(
         self, anchor: Anchor, x: Array, held: HeldMotion | None
     ) -> dict[str, Array]:
