@@ -332,7 +332,7 @@ def test_differences_of_loads_that_were_found_or_could_be_are_in_text_and_files(
     vars(found)["load_comparisons"] = (one, other)
     assert found.disputes == {("gray", "green"): 3.2}
     assert "estimated on gray and on green differ by 3.2" in " ".join(found.messages)
-    assert "as disputed with a probability of 80 % from: gray and green 5 %; " in str(found)
+    assert "differed by 5 % between gray and green would have been reported" in str(found)
     for content in (identified_json(found), to_json(found)):
         kept = [
             LoadComparison.of_json(x) for x in json.loads(json.dumps(content["load_comparisons"]))

@@ -248,7 +248,8 @@ def test_the_loads_stand_beside_the_differences_that_would_have_been_seen(folder
         content["parameters"]["robot.load_share@as_built"] = shares
         path.write_text(json.dumps(content))
     blocks = page_of(folder)["loads"]
-    assert "wood and rug 6 %; the comparison says nothing of the loads on wood" in words(blocks)
+    assert "A wheel's load that differed by 6 % between wood and rug would" in words(blocks)
+    assert "between wood and tiles (30 %) the comparison of loads says nothing" in words(blocks)
     (table,) = (block for block in blocks if isinstance(block, TableBlock))
     assert [tuple(row) for row in table.rows] == [
         ("wood and rug", "yes", "3.1", "6", "11"),

@@ -41,6 +41,8 @@ LARGEST_SEEN = 0.25
 """Smallest reported difference beyond which the test says nothing.
 
 It is 3.5 stds of the difference of two floors' biases with the std of 0.05 that is expected."""
+MOST_PAIRS = 6
+"""Largest number of pairs of floors that a sentence names."""
 _LEAST_CHANCE = 1e-300
 """Smallest p-value that is converted to standard errors."""
 _UNINFORMATIVE_STD = 1.0
@@ -126,21 +128,27 @@ def sensitivity(found: Sequence[LoadComparison]) -> str:
 
     It is empty without comparisons.
     """
-    seen = [f"{_pair(c)} {100 * c.seen:.0f} %" for c in found if c.seen <= LARGEST_SEEN]
+    seen = [f"{100 * c.seen:.0f} % {_pair(c)}" for c in found if c.seen <= LARGEST_SEEN]
     unseen = [f"{_pair(c)} ({100 * c.seen:.0f} %)" for c in found if c.seen > LARGEST_SEEN]
     parts = []
     if seen:
         parts.append(
-            f"a difference of a wheel's load between two floors is reported as disputed with a "
-            f"probability of {100 * POWER:.0f} % from: {', '.join(seen)}"
+            f"a wheel's load that differed by {_listed(seen)} would have been reported as disputed "
+            f"with a probability of {100 * POWER:.0f} %"
         )
     if unseen:
-        parts.append(f"the comparison says nothing of the loads on {', '.join(unseen)}")
+        parts.append(f"{_listed(unseen)} the comparison of loads says nothing")
     return "; ".join(parts)
 
 
 def _pair(of: LoadComparison) -> str:
-    return " and ".join(of.floors)
+    return f"between {' and '.join(of.floors)}"
+
+
+def _listed(pairs: Sequence[str]) -> str:
+    """Return the first pairs of floors, and the number of further ones."""
+    more = len(pairs) - MOST_PAIRS
+    return ", ".join(pairs[:MOST_PAIRS]) + (f" and so for {more} more pairs" if more > 0 else "")
 
 
 def marked(

@@ -130,11 +130,12 @@ def test_the_sentence_separates_what_was_seen_from_what_could_not_be():
     seen = LoadComparison(("gray", "green"), 1.7, (0.052, 0.101, 0.052))
     unseen = LoadComparison(("gray", "table"), 1.3, (0.501, 0.868, 0.514))
     assert sensitivity([seen, unseen]) == (
-        "a difference of a wheel's load between two floors is reported as disputed with a "
-        "probability of 80 % from: gray and green 5 %; the comparison says nothing of the loads on "
-        "gray and table (50 %)"
+        "a wheel's load that differed by 5 % between gray and green would have been reported as "
+        "disputed with a probability of 80 %; between gray and table (50 %) the comparison of "
+        "loads says nothing"
     )
-    assert sensitivity([unseen]).startswith("the comparison says nothing of the loads on gray")
+    assert sensitivity([unseen]).startswith("between gray and table (50 %) the comparison")
+    assert sensitivity([seen] * 8).count("5 %") == 6
     assert not sensitivity([])
     assert not seen.disputed
     assert replace(seen, standard_errors=2.6).disputed
