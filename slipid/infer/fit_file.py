@@ -134,6 +134,7 @@ def identified_json(fit: Fit) -> Content:
         "curves": curves_json(fit.curves),
         "validity": {floor: asdict(v) for floor, v in fit.validity.items()},
         **_held_out_json(fit),
+        "load_comparisons": [c.to_json() for c in fit.load_comparisons],
         "messages": list(fit.messages),
         **_selected_json(fit),
         "data": {"hash": fit.data_hash, "runs": [name for name, _ in fit.runs]},
@@ -181,6 +182,7 @@ def to_json(fit: Fit) -> Content:
         "parameters": {p: asdict(e) for p, e in fit.parameters.items()},
         "derived": {p: asdict(e) for p, e in fit.derived.items()},
         "flat": [asdict(f) | {"text": f.text} for f in fit.flat],
+        "load_comparisons": [c.to_json() for c in fit.load_comparisons],
         "messages": list(fit.messages),
         "variances": {
             name: {"variance": v, "std": float(np.sqrt(v)), "unit": fit.variance_unit[name]}

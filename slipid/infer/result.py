@@ -23,7 +23,7 @@ from slipid.fitting.shared_effects import FittedEffects
 from slipid.fitting.variances import Search, Square
 from slipid.infer.held_out import HeldOut, doubted
 from slipid.infer.slip_curves import SlipCurve
-from slipid.infer.verdicts.disputed import disputes, marked
+from slipid.infer.verdicts.disputed import LoadComparison, load_comparisons, marked
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
@@ -366,9 +366,18 @@ class Fit:
         return self.space.with_pooled(float(np.sqrt(self.variance[POOLED])))
 
     @cached_property
+    def load_comparisons(self) -> tuple[LoadComparison, ...]:
+        """Comparison of the wheel loads of every pair of floors, the most sensitive first."""
+        return load_comparisons(self.verdict_space, self.z, self.covariance)
+
+    @property
     def disputes(self) -> dict[tuple[str, str], float]:
-        """Difference of wheel loads [standard error], keyed by each pair of disagreeing floors."""
-        return disputes(self.verdict_space, self.z, self.covariance)
+        """Difference of wheel loads [standard error], keyed by each pair of disagreeing floors.
+
+        The largest difference comes first.
+        """
+        found = {c.floors: c.standard_errors for c in self.load_comparisons if c.disputed}
+        return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 
     @cached_property
     def flat(self) -> tuple[FlatDirection, ...]:

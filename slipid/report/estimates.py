@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 from rich.text import Text
 
+from slipid.infer.verdicts.disputed import sensitivity
 from slipid.report.calibration import show_calibration
 from slipid.report.gains import show_gains
 from slipid.report.held_out import PREDICTED, held_out_sentence
@@ -145,6 +146,8 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
         page.line(f"profile: {profile.sentence}")
     if fit.held_out is not None:
         page.line(held_out_sentence(fit.held_out, PREDICTED))
+    if fit.load_comparisons:
+        page.line(sensitivity(fit.load_comparisons))
     page.notes(fit.messages)
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 

@@ -132,9 +132,9 @@ def nuts(path, seed, out, block=None):
     import jax
     import jax.numpy as jnp
     from numpyro.infer import MCMC, NUTS
+    from slipid.infer.posterior.transport_map import _placed, gaussian
 
     from slipid.infer.posterior.blocks import unpacked
-    from slipid.infer.posterior.transport_map import _placed, gaussian
 
     d = density = density_of(problem_of(FLOOR), pickle.loads(Path(path).read_bytes()))
     map = gaussian(d.centre, d.covariance, d.group)

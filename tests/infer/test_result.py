@@ -28,6 +28,7 @@ from slipid.infer.result import Fit
 from slipid.infer.robot_held_out import robot_held_out
 from slipid.infer.slip_curves import by_encoders, has_steady_command, validity
 from slipid.infer.summary import summarise
+from slipid.infer.verdicts.disputed import LoadComparison
 from slipid.infer.verdicts.estimates import estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
 from slipid.lab.selftest.logs import (
@@ -319,6 +320,24 @@ def test_identified_json_has_the_documented_content():
     assert found["surfaces"] == ["soft"]
     assert set(found["curves"]["soft"]) == {"torque_nm", "slip", "slip_lo", "slip_hi", "at"}
     assert found["data"]["runs"] == [log.name for log in made(True)[1].logs]
+
+
+def test_differences_of_loads_that_were_found_or_could_be_are_in_text_and_files():
+    fit = dataclasses.replace(fit_of(True))
+    assert identified_json(fit)["load_comparisons"] == []  # on a single floor
+    assert "as disputed" not in str(fit)
+    one = LoadComparison(("gray", "green"), 3.2, (0.05, 0.1, 0.05))
+    other = LoadComparison(("gray", "table"), 1.0, (0.5, 0.9, 0.5))
+    found = dataclasses.replace(fit)
+    vars(found)["load_comparisons"] = (one, other)
+    assert found.disputes == {("gray", "green"): 3.2}
+    assert "estimated on gray and on green differ by 3.2" in " ".join(found.messages)
+    assert "differed by 5 % between gray and green would have been reported" in str(found)
+    for content in (identified_json(found), to_json(found)):
+        kept = [
+            LoadComparison.of_json(x) for x in json.loads(json.dumps(content["load_comparisons"]))
+        ]
+        assert kept == [one, other]
 
 
 def held_out_of(change):

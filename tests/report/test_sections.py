@@ -7,6 +7,7 @@ import pytest
 
 from slipid.app.reference_robots import reference_robot
 from slipid.exports.feedforward import gains_json
+from slipid.infer.verdicts.disputed import LoadComparison
 from slipid.model.feedforward import Feedforward, Gain
 from slipid.report.html.blocks import CopyLines, FigureBlock, TableBlock, TextBlock
 from slipid.report.html.evidence import FitEvidence, Quarters, write_evidence
@@ -233,6 +234,27 @@ def test_the_table_of_what_was_driven_is_that_of_two_wheels(folder):
     table = next(block for block in page_of(folder)["data"] if isinstance(block, TableBlock))
     assert "directions" not in table.head  # two wheels drive ahead or back
     assert dict(zip(table.head, table.rows[0], strict=True))["rest [s]"] == "4"
+
+
+def test_the_loads_stand_beside_the_differences_that_would_have_been_seen(folder):
+    write_evidence(driven((0.1, 0.2), 0.0), folder)
+    ends = [[0.45, 0.55], [0.45, 0.55]]
+    shares = parameter([0.5, 0.5], ends, "identified", 0.1) | {"labels": ["wheel 1", "wheel 2"]}
+    one = LoadComparison(("wood", "rug"), 3.1, (0.06, 0.11)).to_json()
+    other = LoadComparison(("wood", "tiles"), 0.2, (0.4, 0.3)).to_json()
+    for name, more in (("identified", {}), ("fit", {"load_comparisons": [one, other]})):
+        path = folder / f"{name}.json"
+        content = json.loads(path.read_text()) | more
+        content["parameters"]["robot.load_share@as_built"] = shares
+        path.write_text(json.dumps(content))
+    blocks = page_of(folder)["loads"]
+    assert "A wheel's load that differed by 6 % between wood and rug would" in words(blocks)
+    assert "between wood and tiles (30 %) the comparison of loads says nothing" in words(blocks)
+    (table,) = (block for block in blocks if isinstance(block, TableBlock))
+    assert [tuple(row) for row in table.rows] == [
+        ("wood and rug", "yes", "3.1", "6", "11"),
+        ("wood and tiles", "no", "0.2", "40", "30"),
+    ]
 
 
 def test_a_command_that_changes_its_direction_is_not_shown_as_the_speed():

@@ -217,19 +217,6 @@ class Density:
         at = self.structure
         return (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]
 
-    def log_likelihoods(
-        self, anchor: Anchor, x: Array, held: HeldMotion | None
-    ) -> dict[str, Array]:
-        """Return log likelihoods of every segment given the shared effects, by residual block."""
-        rest, robot = self.without_effects(anchor, x, held)
-        out = {k: anchor.log_student(k, r) for k, r in rest.items()}
-        camera, spread = lk.log_jacobians(robot, anchor.batch, anchor.noise(robot))
-        if "motion" in out:
-            out["motion"] += camera
-        if "voltage" in out:
-            out["voltage"] += spread
-        return out
-
     def residual_blocks(
         self, anchor: Anchor, x: Array, held: HeldMotion | None
     ) -> dict[str, Array]:

@@ -28,6 +28,7 @@ from slipid.infer.posterior.blocks import Chain, ChainBlock, Plan
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, effects_at
 from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.infer.posterior.diagnosis import Posterior
+from slipid.infer.posterior.left_out import log_likelihoods
 from slipid.infer.result import Fit, required
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
@@ -141,8 +142,7 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
     noise, noise_dims = _noise(problem, found)
     x = found.z
     density = Density(problem, replace(Fitted.of(fit), z=x.mean(axis=(0, 1))), EVERYTHING)
-    of_segment = density.mapped(Density.log_likelihoods, x.reshape(-1, x.shape[-1]), None)
-    per_segment = {k: np.asarray(v).reshape(*x.shape[:2], -1) for k, v in of_segment.items()}
+    per_segment = log_likelihoods(density, x, np.asarray(w.run))
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
     measured, predicted, data_dims = _data(

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from rich.text import Text as Cell
 
+from slipid.lab.benchmark.summary import TOO_FEW
 from slipid.report import page as terminal
 from slipid.report.html import figures as draw
 from slipid.report.html.blocks import Badge, Block, FigureBlock, PageSection, TableBlock, TextBlock
@@ -89,7 +90,7 @@ def shown(rows: Content) -> list[str]:
     return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
 
 
-def in_words(name: str, value: Sequence[float] | None) -> str:
+def in_words(name: str, value: Sequence[float | None] | None) -> str:
     """Return a field's value as a string, with its interval if the field is in `WITH_INTERVALS`.
 
     The string is empty for None.
@@ -98,8 +99,13 @@ def in_words(name: str, value: Sequence[float] | None) -> str:
         return ""
     _, factor, places = COLUMNS[name]
     sign = "+" if name == "behind" else ""
-    middle, low, high = (f"{factor * x:{sign}.{places}f}" for x in value)
-    return f"{middle} [{low}, {high}]" if name in WITH_INTERVALS else middle
+    middle, *ends = (f"{factor * x:{sign}.{places}f}" for x in value if x is not None)
+    return _with_interval(middle, ends) if name in WITH_INTERVALS else middle
+
+
+def _with_interval(middle: str, ends: Sequence[str]) -> str:
+    """Return a value with the ends of its interval, or with "-" if it has none."""
+    return f"{middle} [{', '.join(ends) or '-'}]"
 
 
 def costs_of(row: Content) -> list[str]:
@@ -110,9 +116,14 @@ def costs_of(row: Content) -> list[str]:
 
 
 def absent(rows: Content) -> list[str]:
-    """Return a line for each reason why rows are absent or unconverged, with the rows' names."""
+    """Return a line for each reason why rows are absent, unconverged or without an interval.
+
+    A line begins with the names of the rows.
+    """
     why: dict[str, list[str]] = {}
     for name, row in rows.items():
+        if any(row[field] is not None and row[field][1] is None for field in WITH_INTERVALS):
+            why.setdefault(TOO_FEW, []).append(name)
         if row["unconverged"]:
             why.setdefault(f"fits that did not converge: {row['unconverged']}", []).append(name)
         if row["absent"]:
@@ -157,12 +168,13 @@ def rectangle(trial: Content) -> ExtraTable:
     rows = sorted(trial["summary"].items(), key=lambda item: item[1]["closure_error_median"])
     body: list[tuple[str, ...]] = []
     for name, row in rows:
-        low, high = row["interval90"]["closure_error_median"]
         ratio = row.get("to_encoder", {}).get("closure_error_median")
         relative = "" if ratio is None else f"{100 * ratio['value']:.0f}"
         if ratio is not None and name != "encoder":
-            relative += " [{:.0f}, {:.0f}]".format(*(100 * x for x in ratio["interval90"]))
-        closure = f"{row['closure_error_median']:.0f} [{low:.0f}, {high:.0f}]"
+            ends = [f"{100 * x:.0f}" for x in ratio["interval90"] or ()]
+            relative = _with_interval(relative, ends)
+        ends = [f"{x:.0f}" for x in row["interval90"]["closure_error_median"] or ()]
+        closure = _with_interval(f"{row['closure_error_median']:.0f}", ends)
         finished, cross = f"{100 * row['finished_share']:.0f}", f"{row['cross_track_rmse']:.0f}"
         body.append((name, closure, relative, finished, cross))
     return ExtraTable(title, head, body)
@@ -178,14 +190,16 @@ def classifiers(found: Content) -> ExtraTable:
     if lost := [f"{row['name']}: {row['absent']}" for row in found["rows"] if row["absent"]]:
         title = f"{title}; failed: {'; '.join(lost)}"
     rows = [row for row in found["rows"] if row["after"]]
+    if any(after["accuracy"][1] is None for row in rows for after in row["after"]):
+        title = f"{title}; -: {TOO_FEW}, or all are alike"
     seconds = [after["seconds"] for after in rows[0]["after"]] if rows else []
     head = ("correct, %, after", *(f"{x:g} s" for x in seconds), "points above slipid", "numbers")
     body: list[tuple[str, ...]] = []
     for row in sorted(rows, key=lambda row: -row["after"][-1]["accuracy"][0]):
-        right = [
-            "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * x for x in after["accuracy"]))
-            for after in row["after"]
-        ]
+        percents = (
+            [f"{100 * x:.0f}" for x in a["accuracy"] if x is not None] for a in row["after"]
+        )
+        right = [_with_interval(middle, ends) for middle, *ends in percents]
         over = in_words("behind", row["after"][-1]["behind"])
         body.append((row["name"], *right, over, str(row["numbers"])))
     return ExtraTable(title, head, body)
@@ -226,8 +240,8 @@ def benchmark_page(found: Content) -> WebPage:
     ]
     lead = (
         "All methods were fitted to the same runs and predict other runs from the sensors of the "
-        "robot; the pose is only used at the start. Brackets contain 90 % intervals by resampling "
-        "of runs; settings were selected on training runs only."
+        "robot; the pose is only used at the start. Brackets contain 90 % intervals by a "
+        "jackknife over clusters of runs; settings were selected on training runs only."
     )
     return WebPage("Slip methods compared", None, lead, sections)
 
@@ -287,8 +301,10 @@ def ranking_figure(rows: Content, name: str, title: str, over: str) -> FigureBlo
     for own, label, shade in ((True, "slipid", "@orange"), (False, "others", "@blue")):
         mine = [n for n in order if n.startswith(OWN_PREFIX) is own]
         middle = [100 * ends[n][0] for n in mine]
-        below = [100 * (ends[n][0] - ends[n][1]) for n in mine]
-        above = [100 * (ends[n][2] - ends[n][0]) for n in mine]
+        below, above = (
+            [0.0 if ends[n][k] is None else 100 * abs(ends[n][k] - ends[n][0]) for n in mine]
+            for k in (1, 2)
+        )
         data.append(draw.errors(middle, mine, (below, above), label, shade))
     layout = {
         "xaxis": draw.axis(f"mean end-point error over the {over} [%]", **draw.logarithmic()),

@@ -37,7 +37,7 @@ class RunScore:
     Attributes:
         name: name of the run.
         floor: floor of the run, with the load set-up.
-        cluster: index of the cluster of runs with correlated errors, which are resampled together.
+        cluster: index of the cluster of runs with correlated errors, which are left out together.
         endpoint_error: distance between predicted and true end, divided by the true chord or by the
             true path length.
         length_error: relative error of the chord, or of the path length.

@@ -1,14 +1,28 @@
-"""Summaries over all folds: means over runs, bootstrap intervals and differences run by run.
+"""Summaries over all folds: means over runs, their intervals and differences run by run.
+
+Errors of runs in similar directions are correlated, so that a floor has fewer independent errors
+than runs. Intervals come from a jackknife: with the estimate T of all runs, and T_g without the
+g-th of the G clusters of a floor,
+
+    s^2 = sum over floors of v,   v = (G - 1) / G sum_g (T_g - T)^2
+
+and the interval is T -+ t s, on a scale on which its ends cannot leave the range of the quantity
+(`Scale`). t is a quantile of Student's distribution with (sum v)^2 / sum (v^2 / d) degrees of
+freedom (Satterthwaite 1946, Biometrics Bulletin 2(6)), where d + 1 = (sum n_g)^2 / sum n_g^2 is the
+effective number of a floor's clusters, which have n_g runs. Source for the jackknife: MacKinnon,
+Nielsen and Webb 2023, J. Applied Econometrics 38(5).
 
 `reading` compares slipid's end-point errors with those of the other rows in sentences.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import expit, logit
+from scipy.stats import t as student
 
 from slipid.lab.benchmark.scores import FoldScore, RunScore
 from slipid.lab.benchmark.slipid_rows import NAME
@@ -16,21 +30,25 @@ from slipid.support.content import Content
 
 MOST_NAMED_ROWS = 4
 """Largest number of tied rows that a sentence names."""
-DRAWS = 1000
-"""Number of draws of the bootstrap."""
-INTERVAL = (0.05, 0.95)
-"""Quantiles of the draws at the ends of a 90 % interval."""
-FEWEST_CLUSTERS = 2
-"""Number of clusters on a floor below which its runs are resampled one by one."""
-Weights = Float[np.ndarray, "draw run"]
+CONFIDENCE = 0.9
+"""Nominal probability that an interval contains the true value."""
+FEWEST_CLUSTERS = 5
+"""Number of clusters on a floor below which a mean over this floor has no interval."""
+TOO_FEW = f"no interval, since the runs form fewer than {FEWEST_CLUSTERS} clusters"
+"""Reason why a mean has no interval."""
+Scale = Literal["any", "positive", "share"]
+"""Range of a quantity: any number, positive numbers, or numbers between 0 and 1.
+
+Intervals are symmetric for the quantity itself, for its logarithm, or for its log odds."""
+Weights = Float[np.ndarray, "estimate run"]
 
 
 class MeanInterval(NamedTuple):
-    """A mean and the ends of its 90 % bootstrap interval."""
+    """A mean and the ends of its 90 % interval, None if there are too few clusters."""
 
     value: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
 
 
 RowSummary = Content
@@ -41,7 +59,7 @@ Values that are not listed are means of the attribute of `RunScore` with the sam
 and then over floors, with their intervals; None if the method does not predict them.
 
 - floors: mean end-point error of each floor, with its load set-up.
-- behind: end-point error less that of slipid on the same resampled runs; None for slipid
+- behind: end-point error less that of slipid on the same runs; None for slipid
   itself, and if slipid has no row.
 - slip_auc: area under the receiver operating characteristic of slip detection, by windows;
   None if all windows slip, or if no window does.
@@ -64,7 +82,7 @@ def summary(
     scores = {name: FoldScore.of_folds(each) for name, each in folds.items()}
     done = {name: score.runs for name, score in scores.items() if score.runs}
     first = next(iter(done.values()), ())
-    weights, base = Bootstrap.of(first), done.get(reference)
+    weights, base = Jackknife.of(first), done.get(reference)
     out: dict[str, RowSummary] = {}
     for name, score in scores.items():
         # all rows of a table are compared on the same runs
@@ -75,87 +93,131 @@ def summary(
 
 
 @dataclass(frozen=True, eq=False)
-class Bootstrap:
-    """Bootstrap draws of runs: on each floor, clusters of runs are resampled with replacement.
-
-    On a floor with fewer than `FEWEST_CLUSTERS` clusters, single runs are resampled.
+class Jackknife:
+    """Weights of runs with which estimates are repeated, each time without one cluster.
 
     Attributes:
         floor: index of the floor of each run.
         names: names of the floors.
-        draws: weight of each run in each draw; in the first draw every run has weight 1.
+        weights: weight of each run in each estimate. In the first estimate every run has weight 1.
+            In each other one, the runs of one cluster have weight 0, and those of the G - 1 other
+            clusters of the same floor G / (G - 1), so that the weight of the floor stays the same.
+        left_out: index of the floor of each estimate's cluster, without the first estimate.
+        degrees: degrees of freedom of each floor; 0 with a single cluster.
     """
 
     floor: Int[np.ndarray, " run"]
     names: tuple[str, ...]
-    draws: Weights
+    weights: Weights
+    left_out: Int[np.ndarray, " cluster"]
+    degrees: Float[np.ndarray, " floor"]
 
     @classmethod
-    def of(cls, runs: Sequence[RunScore]) -> "Bootstrap":
-        """Return draws of scored runs; a run with a negative cluster is a separate cluster."""
+    def of(cls, runs: Sequence[RunScore]) -> "Jackknife":
+        """Return weights of scored runs; a run with a negative cluster is a separate cluster."""
         sector = np.array([run.cluster for run in runs])
         alone = -1 - np.arange(len(runs))
         return cls.by([run.floor for run in runs], np.where(sector < 0, alone, sector))
 
     @classmethod
-    def by(cls, floors: Sequence[str], cluster: np.ndarray) -> "Bootstrap":
-        """Return draws of items, given the floor and the cluster of each item."""
+    def by(cls, floors: Sequence[str], cluster: np.ndarray) -> "Jackknife":
+        """Return weights of items, given the floor and the cluster of each item."""
         names = tuple(dict.fromkeys(floors))
         floor = np.array([names.index(name) for name in floors])
-        rng = np.random.default_rng(0)
-        draws = np.ones((DRAWS + 1, len(floors)))
+        rows, left_out, degrees = [np.ones(len(floors))], [], []
         for k in range(len(names)):
-            mine = np.flatnonzero(floor == k)
-            kinds, of = np.unique(cluster[mine], return_inverse=True)
-            # resample single runs if there are too few clusters to estimate their scatter
-            if len(kinds) < FEWEST_CLUSTERS:
-                kinds, of = mine, np.arange(len(mine))
-            picked = rng.multinomial(len(kinds), np.full(len(kinds), 1 / len(kinds)), DRAWS)
-            draws[1:, mine] = picked[:, of]
-        return cls(floor, names, draws)
+            kinds, counts = np.unique(cluster[floor == k], return_counts=True)
+            degrees.append(counts.sum() ** 2 / (counts**2).sum() - 1.0)
+            for kind in kinds if len(kinds) > 1 else ():
+                whole = np.where(cluster == kind, 0.0, len(kinds) / (len(kinds) - 1))
+                rows.append(np.where(floor == k, whole, 1.0))
+                left_out.append(k)
+        return cls(floor, names, np.array(rows), np.array(left_out, int), np.array(degrees))
 
-    def mean(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
-        """Return the mean over floors of means over runs, in every draw; NaN values are ignored."""
-        return np.nanmean([self.on(x, k) for k in range(len(self.names))], axis=0)
+    def mean(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " estimate"]:
+        """Return the mean over floors of means over runs; floors without any value are ignored.
 
-    def over_all(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
-        """Return the mean over all runs, whatever their floor, in every draw."""
-        return np.asarray(self.draws @ x / np.maximum(self.draws.sum(axis=1), 1e-12))
+        NaN values are ignored too, unless a floor's only values are those of the cluster that is
+        left out: its mean is then unknown.
+        """
+        known = [k for k in range(len(self.names)) if np.isfinite(x[self.floor == k]).any()]
+        return np.mean([self.on(x, k) for k in known], axis=0)
 
-    def on(self, x: Float[np.ndarray, " run"], floor: int) -> Float[np.ndarray, " draw"]:
-        """Return the mean over the runs on a floor, in every draw."""
+    def over_all(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " estimate"]:
+        """Return the mean over all runs, whatever their floor."""
+        return np.asarray(self.weights @ x / self.weights.sum(axis=1))
+
+    def on(self, x: Float[np.ndarray, " run"], floor: int) -> Float[np.ndarray, " estimate"]:
+        """Return the mean over the runs on a floor; NaN values are ignored."""
         mine = (self.floor == floor) & np.isfinite(x)
-        w = self.draws[:, mine]
+        w = self.weights[:, mine]
         total = w.sum(axis=1)
         return np.where(total > 0, w @ x[mine] / np.maximum(total, 1e-12), np.nan)
 
+    def interval(
+        self,
+        estimates: Float[np.ndarray, " estimate"],
+        scale: Scale = "any",
+        floor: int | None = None,
+    ) -> MeanInterval:
+        """Return the first estimate with its interval, of a quantity on one floor or on all.
 
-def mean_interval(draws: Float[np.ndarray, " draw"]) -> MeanInterval:
-    """Return the first draw (the original runs), with the 90 % interval of all later draws."""
-    low, high = np.nanquantile(draws[1:], INTERVAL)
-    return MeanInterval(float(draws[0]), float(low), float(high))
+        The interval is missing if there are too few clusters, and for a share of exactly 0 or 1,
+        which has no scatter from which its error could be estimated.
+        """
+        value = float(estimates[0])
+        mine = range(len(self.names)) if floor is None else [floor]
+        count = np.array([(self.left_out == k).sum() for k in mine])
+        change = (estimates[1:] - value) ** 2
+        sums = np.array([change[self.left_out == k].sum() for k in mine])
+        variance = sums * (1 - 1 / np.maximum(count, 1))
+        too_few = count.min() < 2 or (count - 1).sum() < FEWEST_CLUSTERS - 1
+        if too_few or not np.isfinite(sums).all() or (scale == "share" and value in (0.0, 1.0)):
+            return MeanInterval(value, None, None)
+        if not variance.any():
+            return MeanInterval(value, value, value)
+        freedom = variance.sum() ** 2 / (variance**2 / self.degrees[mine]).sum()
+        quantile = float(student.isf((1 - CONFIDENCE) / 2, max(freedom, 1.0)))
+        return _around(value, quantile * float(np.sqrt(variance.sum())), scale)
+
+
+def _around(value: float, half: float, scale: Scale) -> MeanInterval:
+    """Return the interval around a value that is symmetric on the scale of the quantity.
+
+    `half` is half its width on the scale of the value itself, if it is narrow.
+    """
+    sides = np.array([-1.0, 1.0])
+    if scale == "positive":
+        low, high = value * np.exp(sides * half / value)
+    elif scale == "share":
+        low, high = expit(logit(value) + sides * half / (value * (1 - value)))
+    else:
+        low, high = value + sides * half
+    return MeanInterval(value, float(low), float(high))
 
 
 def _summary(
     score: FoldScore[RunScore],
     folds: Sequence[FoldScore[RunScore]],
     rival: Sequence[RunScore] | None,
-    by: Bootstrap,
+    by: Jackknife,
 ) -> RowSummary:
     """Return the row of a method, compared with the scores `rival` if there are any."""
     runs, ended = score.runs, folds if score.runs else ()
 
-    def mean(name: str) -> MeanInterval | None:
+    def mean(name: str, scale: Scale = "positive") -> MeanInterval | None:
         found = [getattr(run, name) for run in runs]
         x = np.array([np.nan if value is None else float(value) for value in found])
-        return mean_interval(by.mean(x)) if np.isfinite(x).any() else None
+        return by.interval(by.mean(x), scale) if np.isfinite(x).any() else None
 
     error = np.array([run.endpoint_error for run in runs])
     behind, floors = None, None
     if runs:
-        floors = {name: mean_interval(by.on(error, k)) for k, name in enumerate(by.names)}
+        floors = {
+            name: by.interval(by.on(error, k), "positive", k) for k, name in enumerate(by.names)
+        }
     if runs and rival:
-        behind = mean_interval(by.mean(error - np.array([run.endpoint_error for run in rival])))
+        behind = by.interval(by.mean(error - np.array([run.endpoint_error for run in rival])))
     return {
         "endpoint_error": mean("endpoint_error"),
         "floors": floors,
@@ -163,9 +225,9 @@ def _summary(
         "length_error": mean("length_error"),
         "heading_error_deg": mean("heading_error_deg"),
         "twist_error": mean("twist_error"),
-        "coverage90": mean("covered90"),
+        "coverage90": mean("covered90", "share"),
         "slip_auc": _auc(runs, by) if runs else None,
-        "floor_accuracy": mean("floor_right"),
+        "floor_accuracy": mean("floor_right", "share"),
         "energy_error": mean("energy_error"),
         "runs": len(runs),
         "numbers": score.numbers,
@@ -179,18 +241,14 @@ def _summary(
     }
 
 
-def _auc(runs: Sequence[RunScore], by: Bootstrap) -> MeanInterval | None:
-    """Return the area under the slip detection curve over all windows; None if it is undefined.
-
-    Its interval is computed from a fifth of the draws, to save time.
-    """
+def _auc(runs: Sequence[RunScore], by: Jackknife) -> MeanInterval | None:
+    """Return the area under the slip detection curve over all windows; None if it is undefined."""
     score = np.concatenate([run.scores for run in runs])
     slips = np.concatenate([np.asarray(run.slips, bool) for run in runs])
     if slips.all() or not slips.any():
         return None
     of = np.repeat(np.arange(len(runs)), [len(run.scores) for run in runs])
-    areas = [area(score, slips, w[of]) for w in by.draws[: DRAWS // 5 + 1]]
-    return mean_interval(np.array(areas))
+    return by.interval(np.array([area(score, slips, w[of]) for w in by.weights]), "share")
 
 
 def area(
@@ -235,7 +293,8 @@ def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
     if not errors:
         return f"{head}error of slipid {mine}; no other row to compare with"
     order = sorted(errors, key=lambda row: errors[row].value)
-    behind = {row: b for row in order if (b := found[row]["behind"]) is not None}
+    paired = {row: b for row in order if (b := found[row]["behind"]) is not None}
+    behind = {row: b for row, b in paired.items() if b.low is not None}
     ahead = [row for row, b in behind.items() if b.high < 0]
     if ahead:
         also = f" (and {len(ahead) - 1} more)" if len(ahead) > 1 else ""
@@ -245,6 +304,8 @@ def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
         )
     best = order[0]
     text = f"{head}error of slipid {mine}, of the best other row, {best}, {_percent(errors[best])}"
+    if paired and not behind:
+        return f"{text}; {TOO_FEW}"
     tied = [row for row, b in behind.items() if b.low <= 0 <= b.high]
     if tied:
         more = f" and {len(tied) - MOST_NAMED_ROWS} more" if len(tied) > MOST_NAMED_ROWS else ""
@@ -258,4 +319,5 @@ def _percent(x: MeanInterval) -> str:
 
 def _points(x: MeanInterval) -> str:
     """Return a difference in percentage points with its interval, as text."""
-    return f"{100 * x.value:+.1f} points [{100 * x.low:+.1f}, {100 * x.high:+.1f}]"
+    ends = (f"{100 * end:+.1f}" for end in (x.low, x.high) if end is not None)
+    return f"{100 * x.value:+.1f} points [{', '.join(ends) or '-'}]"

@@ -127,7 +127,7 @@ def _bars(axes: Axes, table: Content, key: str, label: str) -> None:
     """Draw a bar with its 90 % interval for the median error `key` of each controller."""
     names = list(table)
     value = np.array([table[n][key] for n in names])
-    low, high = np.array([table[n]["interval90"][key] for n in names]).T
+    low, high = np.array([table[n]["interval90"][key] or [np.nan] * 2 for n in names]).T
     at = np.arange(len(names))[::-1]
     axes.barh(at, value, color="#9bb8cf", height=0.7)
     axes.hlines(at, low, high, color=INK, lw=1.2)

@@ -21,7 +21,9 @@ from slipid.fitting.shared_effects import AXES
 from slipid.fitting.variances import DEGREES
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.infer.posterior.density import Density
+from slipid.infer.posterior.left_out import log_likelihoods
 from slipid.search_space import Choice
+from tests.helpers.density_slopes import slope
 from tests.helpers.made_windows import made, residuals, robot
 
 pytestmark = pytest.mark.slow  # compiles densities
@@ -197,26 +199,57 @@ def test_terms_equal_the_posterior_by_definition(problem, part):
 
 
 def test_residuals_are_less_shared_effects(problem):
-    """Residuals less the conditional mean of shared effects have Student t likelihoods."""
     d, dense = density(problem, EVERYTHING), Dense(problem, BLOCKS[EVERYTHING])
     x = near(d)
     found = d.mapped(Density.residual_blocks, x, None)
-    likelihoods = d.mapped(Density.log_likelihoods, x, None)
-    assert found.keys() == likelihoods.keys() == set(BLOCKS[EVERYTHING])
+    assert found.keys() == set(BLOCKS[EVERYTHING])
     for j, one in enumerate(x):
         z = np.asarray(d.full(d.anchor, jnp.asarray(one)))
-        blocks, jacobian = residuals_at(problem, z)
+        blocks, _ = residuals_at(problem, z)
         moved = dense.effects(z)
         assert np.abs(moved).max() > 0.001
         blocks["motion"] = blocks["motion"] - moved
         for k, r in blocks.items():
             np.testing.assert_allclose(found[k][j], r, rtol=1e-8, atol=1e-10)
+
+
+def left_out_by_definition(dense, r, v, k, out):
+    """Return the log density of segment k without the segments `out`, by dense matrices."""
+    n, m = r.shape
+    whole = (dense.shared + block_diag(*dense.own["motion"])).reshape(n, m, n, m)
+    shared, rest = dense.shared.reshape(n, m, n, m), np.setdiff1d(np.arange(n), out)
+    others = whole[np.ix_(rest, range(m), rest, range(m))].reshape(len(rest) * m, -1)
+    across = shared[k][:, rest].reshape(m, -1)
+    mean = across @ np.linalg.solve(others, r[rest].ravel())
+    scale = v[k] + shared[k, :, k] - across @ np.linalg.solve(others, across.T)
+    return multivariate_t.logpdf(r[k], mean, scale, DEGREES)
+
+
+@pytest.mark.parametrize("segments", [1, 3])
+def test_log_likelihoods_are_those_of_runs_left_out(problem, segments):
+    """Runs of three segments are predicted segment by segment."""
+    d, dense = density(problem, EVERYTHING), Dense(problem, BLOCKS[EVERYTHING])
+    surface, run = np.asarray(problem.batch.surface), np.zeros(len(problem.windows), int)
+    for g in np.unique(surface):
+        run[surface == g] = 100 * g + np.arange((surface == g).sum()) // segments
+    x = near(d)
+    found = log_likelihoods(d, x[None], run)
+    assert found.keys() == set(BLOCKS[EVERYTHING])
+    for j, one in enumerate(x):
+        blocks, jacobian = residuals_at(problem, np.asarray(d.full(d.anchor, jnp.asarray(one))))
+        for k, r in blocks.items():
             v = spread_of(problem, k)
             each = [
                 multivariate_t.logpdf(a, shape=b, df=DEGREES) for a, b in zip(r, v, strict=True)
             ]
+            if k == "motion":
+                out = [
+                    np.flatnonzero((run == n) & (np.arange(len(run)) >= i))
+                    for i, n in enumerate(run)
+                ]
+                each = [left_out_by_definition(dense, r, v, i, o) for i, o in enumerate(out)]
             expected = np.array(each) + jacobian.get(k, 0.0)
-            np.testing.assert_allclose(likelihoods[k][j], expected, rtol=1e-8)
+            np.testing.assert_allclose(found[k][0, j], expected, rtol=1e-7)
 
 
 def test_the_electric_part_holds_the_motion_of_each_walker(problem):
@@ -245,7 +278,7 @@ def test_its_curvature_is_the_information_of_the_fit():
     precision = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
     d = Density(problem, Fitted(z, log_v, np.linalg.inv(precision)), EVERYTHING)
     h = 1e-2 * np.sqrt(np.diag(d.covariance)) * np.eye(d.size)
-    bend = -(d.slope(z + h) - d.slope(z - h)) / (2 * np.diag(h)[:, None])
+    bend = -(slope(d, z + h) - slope(d, z - h)) / (2 * np.diag(h)[:, None])
     scale = np.sqrt(np.diag(precision))
     np.testing.assert_allclose(
         bend / scale / scale[:, None], precision / scale / scale[:, None], atol=1e-3
@@ -279,9 +312,9 @@ def test_far_from_the_fit_twists_are_solved_anew(problem):
 def test_gradients_are_those_of_finite_differences(problem):
     d = density(problem, MOTION)
     [x], h = near(d, 1), 1e-5 * np.eye(d.size)
-    [slope] = d.slope(x[None])
+    [found] = slope(d, x[None])
     numeric = (d.terms(x + h).sum(axis=1) - d.terms(x - h).sum(axis=1)) / 2e-5
-    np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(found, numeric, rtol=1e-4, atol=1e-3)
 
 
 def test_a_single_floor_is_a_single_group():

@@ -13,6 +13,7 @@ from slipid.fitting.problem import Problem
 from slipid.infer.posterior.coordinates import ELECTRIC, MOTION, Fitted
 from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.search_space import Choice
+from tests.helpers.density_slopes import slope
 from tests.helpers.made_windows import made, robot
 
 pytestmark = pytest.mark.slow  # compiles densities
@@ -71,12 +72,12 @@ def gaussian(second, held):
     """Return the mode and the covariance there, by scipy and by finite differences."""
 
     def loss(x):
-        return -log_prob(second, held, x[None])[0], -second.slope(x[None], held)[0]
+        return -log_prob(second, held, x[None])[0], -slope(second, x[None], held)[0]
 
     mode = minimize(loss, second.centre, jac=True, method="BFGS").x
     h = 1e-3 * np.eye(second.size)
     many = type(held)(*(np.repeat(k, second.size, axis=0) for k in held))
-    bend = -(second.slope(mode + h, many) - second.slope(mode - h, many)) / 2e-3
+    bend = -(slope(second, mode + h, many) - slope(second, mode - h, many)) / 2e-3
     return mode, np.linalg.inv(0.5 * (bend + bend.T))
 
 

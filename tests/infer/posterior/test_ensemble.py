@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
+
 from slipid.infer.posterior.blocks import LogDensity, Plan
 from slipid.infer.posterior.diagnosis import autocorrelation_time, diagnose
 from slipid.infer.posterior.ensemble import chain as positions

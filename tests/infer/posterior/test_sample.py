@@ -15,7 +15,6 @@ from slipid.fitting.problem import Problem
 from slipid.infer.posterior.blocks import ChainBlock
 from slipid.infer.posterior.coordinates import Fitted, effects_at
 from slipid.infer.posterior.sample import drawn_variances, thinned
-from slipid.infer.posterior.transport_map import gaussian
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -131,9 +130,8 @@ def test_the_std_of_load_biases_is_drawn_from_its_likelihood(problem):
 def test_thinned_draws_are_spread_over_steps_and_walkers_and_keep_their_log_density():
     chain = np.arange(2 * 60 * 8, dtype=float).reshape(2, 60, 8, 1)
     random = np.zeros((2, 624), np.uint32), np.zeros((2, 3))
-    map = gaussian(np.zeros(1), np.eye(1), np.zeros(1, int))
     blocks = [
-        ChainBlock(k, part, 0.5 * part[..., 0], random, np.zeros(2), map, np.array([0.1]))
+        ChainBlock(k, part, 0.5 * part[..., 0], random, np.zeros(2), None)
         for k, part in enumerate(np.split(chain, 3, axis=1))
     ]
     x, log_prob = thinned(chain, blocks, 40)

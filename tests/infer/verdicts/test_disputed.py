@@ -1,7 +1,11 @@
-"""Floors that disagree about the loads are named, those that agree up to noise are not."""
+"""Floors that disagree about the loads are named, those that agree up to noise are not.
+
+The smallest difference that is reported with a given probability is compared with simulations.
+"""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import equinox as eqx
@@ -12,8 +16,9 @@ from scipy.stats import chi2, norm
 
 from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import Problem
-from slipid.infer.verdicts.disputed import disputes, marked
+from slipid.infer.verdicts.disputed import LoadComparison, load_comparisons, marked, sensitivity
 from slipid.infer.verdicts.estimates import estimates
+from slipid.parameter import share_basis
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -34,6 +39,12 @@ STD = {
 def problem_of(truth, runs=96):
     w = made(truth, runs=runs, std=STD)
     return Problem(replace(w, has_current=False, has_voltage=False), robot(), CHOICES)
+
+
+def disputes(space, z, covariance):
+    """Return the standard errors of pairs of floors that disagree."""
+    found = load_comparisons(space, z, covariance)
+    return {one.floors: one.standard_errors for one in found if one.disputed}
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +85,61 @@ def test_a_floor_with_another_law_is_named(bias):
     problem = problem_of(truth)
     end = optimise(problem)
     pooled = np.exp(end.state.log_variance[problem.objective.pooled])
-    found = disputes(problem.space.with_pooled(np.sqrt(pooled)), end.state.z, end.covariance)
-    assert list(found) == [("firm", "soft")] * (bias > 0)
+    space = problem.space.with_pooled(np.sqrt(pooled))
+    (found,) = load_comparisons(space, end.state.z, end.covariance)
+    assert found.floors == ("firm", "soft")
+    assert found.disputed == (bias > 0)
+    if bias:
+        assert max(found.smallest) < 1.5 * bias  # the difference of the first wheel's load
+
+
+def test_a_difference_of_the_stated_size_is_found_in_four_of_five_fits(problem):
+    """Data of which the likelihood knows the true biases up to noise of known covariance."""
+    space, rng, pooled = problem.space, np.random.default_rng(2), 0.03**2
+    root = 40 * rng.normal(size=(space.size, space.size))
+    own = root @ root.T + np.eye(space.size)  # information, wide priors of the biases included
+    precision, at = own.copy(), np.flatnonzero(space.pooled)
+    precision[at, at] += 1 / pooled - 1.0
+    covariance, fitted = np.linalg.inv(precision), space.with_pooled(np.sqrt(pooled))
+    one, other = (space.slices[f"surface.{floor}.load_bias"] for floor in ("firm", "soft"))
+    (about,) = load_comparisons(fitted, np.zeros(space.size), covariance)
+    noise = np.linalg.cholesky(np.linalg.inv(own))
+    spread = np.linalg.inv(own)
+    spread = spread[one] - spread[other]
+    spread = spread[:, one] - spread[:, other]
+
+    def found(gap):
+        """Return the fraction of fits that report a true difference of the biases."""
+        truth = np.zeros(space.size)
+        truth[one] = gap
+        every = truth + rng.standard_normal((500, space.size)) @ noise.T
+        z = np.linalg.solve(precision, own @ every.T).T
+        return np.mean([load_comparisons(fitted, row, covariance)[0].disputed for row in z])
+
+    for wheel, smallest in zip(share_basis(3), about.smallest, strict=True):
+        worst = smallest * spread @ wheel / (wheel @ spread @ wheel)
+        assert worst @ wheel == pytest.approx(smallest)
+        assert found(worst) == pytest.approx(0.8, abs=0.05)
+        alone = smallest * wheel / (wheel @ wheel)
+        assert alone @ wheel == pytest.approx(smallest)
+        assert found(alone) >= 0.75
+    assert found(np.zeros(2)) < 0.03
+
+
+def test_the_sentence_separates_what_was_seen_from_what_could_not_be():
+    seen = LoadComparison(("gray", "green"), 1.7, (0.052, 0.101, 0.052))
+    unseen = LoadComparison(("gray", "table"), 1.3, (0.501, 0.868, 0.514))
+    assert sensitivity([seen, unseen]) == (
+        "a wheel's load that differed by 5 % between gray and green would have been reported as "
+        "disputed with a probability of 80 %; between gray and table (50 %) the comparison of "
+        "loads says nothing"
+    )
+    assert sensitivity([unseen]).startswith("between gray and table (50 %) the comparison")
+    assert sensitivity([seen] * 8).count("5 %") == 6
+    assert not sensitivity([])
+    assert not seen.disputed
+    assert replace(seen, standard_errors=2.6).disputed
+    assert LoadComparison.of_json(json.loads(json.dumps(seen.to_json()))) == seen
 
 
 @pytest.mark.slow

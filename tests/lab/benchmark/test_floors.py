@@ -6,6 +6,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import expit, logit
+from scipy.stats import t as student
 
 from slipid.lab.benchmark.floors.fitting import (
     Cells,
@@ -229,10 +231,16 @@ def test_accuracies_and_differences_by_hand():
     assert found["behind"].value == 0.25
     assert found["by_floor"] == {"grass": pytest.approx(2 / 3), "snow": 1.0}
     assert found["log_score"] == pytest.approx(np.log([0.8, 0.2, 0.5, 0.5]).mean())
-    # the run of snow is drawn in every draw; of grass a twice, b twice, or both
-    assert found["accuracy"].low == pytest.approx(3 / 5)
-    assert found["accuracy"].high == pytest.approx(1.0)
+    assert found["accuracy"].low is None  # there are three runs
     assert after_seconds(mine, None)[0]["behind"] is None
+
+
+def test_the_interval_of_an_accuracy_by_hand():
+    right = np.array([1, 1, 1, 1, 0, 1, 1, 0, 1, 1])
+    found = after_seconds([answer(f"r{k}", r) for k, r in enumerate(right)], None)[0]["accuracy"]
+    half = student.isf(0.05, 9) * right.std() / 3
+    ends = expit(logit(0.8) + np.array([-half, half]) / (0.8 * 0.2))
+    assert (found.low, found.high) == pytest.approx(tuple(ends))
 
 
 def test_stretches_of_one_run_are_no_independent_witnesses():

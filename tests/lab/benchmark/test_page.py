@@ -62,6 +62,18 @@ def test_the_best_row_comes_first_and_absent_rows_have_reasons():
     assert "quann_slip: failed: ValueError: <no> rank" in text(CONTENT)
 
 
+def test_a_missing_interval_has_a_reason_and_no_error_bar():
+    content = copy.deepcopy(CONTENT)
+    rows = content["sets"]["carpets"]["protocols"]["known_floor"]
+    rows["encoder"] |= {"endpoint_error": [0.3, None, None], "behind": [0.25, None, None]}
+    line = next(line for line in text(content).splitlines() if line.startswith("encoder"))
+    assert line.split()[1:5] == ["30.0", "[-]", "+25.0", "[-]"]
+    assert "encoder: no interval, since the runs form fewer than 5 clusters" in page(content)
+    (figure,) = figures(content)
+    bars = {tuple(d["y"]): d["error_x"] for d in figure.data if "error_x" in d}
+    assert bars[("encoder",)]["array"] == [0.0]
+
+
 def page(content):
     return rendered(benchmark_page(content))
 

@@ -7,9 +7,11 @@ import pytest
 from sklearn.metrics import roc_auc_score
 
 from slipid.fitting.variances import DEGREES
+from slipid.lab.benchmark.report import absent, in_words
 from slipid.lab.benchmark.scores import FoldScore, scored
 from slipid.lab.benchmark.summary import (
-    Bootstrap,
+    TOO_FEW,
+    Jackknife,
     MeanInterval,
     area,
     sentence,
@@ -178,30 +180,86 @@ def test_a_difference_is_paired():
     assert found["slipid"]["behind"] is None
 
 
-@pytest.mark.slow
-def test_intervals_cover_the_true_mean_at_their_level():
-    rng = np.random.default_rng(1)
-    hits = 0
-    for _ in range(100):
-        found = summary({"slipid": [rows(rng.normal(0.5, 0.1, 30))]}, "slipid")["slipid"]
-        assert found["endpoint_error"] is not None
-        hits += found["endpoint_error"].low <= 0.5 <= found["endpoint_error"].high
-    assert 80 <= hits <= 97
+CLUSTERED_SQUARES, DISTANCES, DIFFERENCES = "squared errors", "distances", "differences"
 
 
-def test_runs_of_a_cluster_are_drawn_together():
+def clustered(kind, clusters, rng):
+    """Return errors of runs in clusters of 1 to 12 runs with correlation 1/2, and their true mean.
+
+    Errors are squares of Gaussian vectors in the plane, their roots, or differences of squares.
+    """
+    of = np.repeat(np.arange(clusters), rng.integers(1, 13, clusters))
+    gauss = (rng.normal(size=(4, clusters))[:, of] + rng.normal(size=(4, len(of)))) / np.sqrt(2)
+    one, other = (gauss[:2] ** 2).mean(axis=0), (gauss[2:] ** 2).mean(axis=0)
+    if kind == DIFFERENCES:
+        return of, one - 0.7 * other, 0.3
+    return (of, one, 1.0) if kind == CLUSTERED_SQUARES else (of, np.sqrt(one), np.sqrt(np.pi) / 2)
+
+
+@pytest.mark.parametrize("kind", [CLUSTERED_SQUARES, DISTANCES, DIFFERENCES])
+@pytest.mark.parametrize("clusters", [5, 12])
+def test_intervals_of_few_clusters_hold_their_level(kind, clusters):
+    """Of many sets, intervals hold 87 to 92 %, those of a percentile bootstrap 73 to 83 %.
+
+    The std of the coverage in 800 sets is 1.2 %.
+    """
+    rng, sets, hits = np.random.default_rng(clusters), 800, 0
+    for _ in range(sets):
+        of, x, mean = clustered(kind, clusters, rng)
+        by = Jackknife.by(["gray"] * len(of), of)
+        found = by.interval(by.mean(x), "any" if kind == DIFFERENCES else "positive")
+        hits += found.low <= mean <= found.high
+    assert 0.845 <= hits / sets <= 0.945
+
+
+def test_intervals_of_a_mean_over_floors_hold_their_level():
+    rng, sets, hits = np.random.default_rng(0), 400, 0
+    for _ in range(sets):
+        parts = [clustered(DISTANCES, clusters, rng) for clusters in (3, 6, 12)]
+        floors = [name for name, part in zip("abc", parts, strict=True) for _ in part[0]]
+        by = Jackknife.by(floors, np.concatenate([of for of, _, _ in parts]))
+        found = by.interval(by.mean(np.concatenate([x for _, x, _ in parts])), "positive")
+        hits += found.low <= parts[0][2] <= found.high
+    assert 0.855 <= hits / sets <= 0.945
+
+
+def test_shares_have_intervals_within_their_range():
+    rng, sets, hits = np.random.default_rng(0), 400, 0
+    for _ in range(sets):
+        right = (rng.random((20, 4)) < rng.beta(4.5, 0.5, 20)[:, None]).astype(float).ravel()
+        by = Jackknife.by(["gray"] * 80, np.repeat(np.arange(20), 4))
+        found = by.interval(by.mean(right), "share")
+        if found.value < 1:
+            assert 0 < found.low < found.value < found.high < 1
+            hits += found.low <= 0.9 <= found.high
+    assert hits / sets >= 0.855
+    assert by.interval(by.mean(np.ones(80)), "share") == MeanInterval(1.0, None, None)
+
+
+def test_runs_of_a_cluster_are_left_out_together():
     runs = [replace(run, cluster=k // 5) for k, run in enumerate(rows(np.zeros(20)).runs)]
-    drawn = Bootstrap.of(runs).draws
-    assert (drawn[:, ::5] == drawn[:, 4::5]).all()
-    assert (drawn.sum(axis=1) == 20).all()
-    assert len({tuple(row) for row in drawn.tolist()}) > 20
+    weights = Jackknife.of(runs).weights
+    assert (weights[:, ::5] == weights[:, 4::5]).all()
+    assert weights.sum(axis=1) == pytest.approx(20)
+    assert sorted(row.tolist().count(0.0) for row in weights) == [0, 5, 5, 5, 5]
 
 
-def test_runs_of_a_floor_with_one_cluster_are_drawn_one_by_one():
-    runs = [replace(run, cluster=7) for run in rows((0.1, 0.3, 0.2, 0.9)).runs]
-    draws = Bootstrap.of(runs).mean(np.array([run.endpoint_error for run in runs]))
-    assert draws[0] == pytest.approx(0.375)
-    assert np.std(draws) > 0.05
+def test_four_clusters_give_no_interval_and_the_reading_says_so():
+    errors = (0.1, 0.3, 0.2, 0.9)
+    found = summary({"slipid": [rows(errors)], "rival": [rows(errors)]}, "slipid")
+    none = MeanInterval(pytest.approx(0.375), None, None)
+    assert found["slipid"]["endpoint_error"] == none
+    assert found["slipid"]["floors"] == {"gray": none}
+    assert sentence("x", "sectors", found).endswith("rival, 37.5 %; " + TOO_FEW)
+    assert in_words("endpoint_error", found["slipid"]["endpoint_error"]) == "37.5 [-]"
+    assert absent(found) == [f"slipid, rival: {TOO_FEW}"]
+    more = summary({"slipid": [rows((*errors, 0.4))]}, "slipid")["slipid"]["endpoint_error"]
+    assert more.low < more.value < more.high
+    assert not absent(summary({"slipid": [rows((*errors, 0.4))]}, "slipid"))
+    # a floor with a single cluster has an unknown error, and so has the mean over floors
+    alone = summary({"slipid": [rows((*errors, 0.4)), rows((0.3,), "green")]}, "slipid")["slipid"]
+    assert alone["endpoint_error"].low is None
+    assert alone["floors"]["gray"].low is not None
 
 
 def test_the_force_balances_region_holds_nine_tenths_of_a_student_t():

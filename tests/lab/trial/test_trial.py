@@ -733,6 +733,10 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
     assert ratio["interval90"] == pytest.approx([0.4, 0.4])
     low, high = found["encoder"]["interval90"]["closure_error_median"]
     assert low < np.median(base) < high
+    few = summaries([run for run in runs if run.seed < 4])["contact"]
+    assert few["runs"] == 4
+    assert few["interval90"]["closure_error_median"] is None
+    assert few["to_encoder"]["closure_error_median"]["interval90"] is None
 
 
 def test_live_readings_are_as_the_sensors_log_them():

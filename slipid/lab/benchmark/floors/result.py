@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slipid.lab.benchmark.summary import Bootstrap, mean_interval
+from slipid.lab.benchmark.summary import Jackknife
 from slipid.support.content import Content
 
 
@@ -35,7 +35,7 @@ Accuracies = Content
 - stretches: number of stretches.
 - accuracy: fraction of the stretches in which the most probable floor is the true one.
 - balanced: mean over floors of the accuracy on each floor.
-- behind: accuracy minus that of slipid, on the same resampled runs; None for slipid itself.
+- behind: accuracy minus that of slipid, on the same runs; None for slipid itself.
 - by_floor: accuracy on each floor.
 - log_score: mean natural logarithm of the probability of the true floor; 0 is best, and equal
   probabilities of n floors give log(1 / n).
@@ -79,19 +79,19 @@ def after_seconds(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> 
 def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> Accuracies:
     """Return the accuracy from answers that were all read after the same time."""
     right = np.array([a.named == a.floor for a in answers], dtype=float)
-    # resample whole runs, since the stretches of one run are correlated
+    # leave out whole runs, since the stretches of one run are correlated
     run = np.unique([a.run for a in answers], return_inverse=True)[1]
-    by = Bootstrap.by([a.floor for a in answers], run)
+    by = Jackknife.by([a.floor for a in answers], run)
     behind = None
     if rival is not None:
         assert [(a.run, a.floor) for a in rival] == [(a.run, a.floor) for a in answers]
         theirs = np.array([a.named == a.floor for a in rival], dtype=float)
-        behind = mean_interval(by.over_all(right - theirs))
+        behind = by.interval(by.over_all(right - theirs))
     return {
         "seconds": answers[0].seconds,
         "stretches": len(answers),
-        "accuracy": mean_interval(by.over_all(right)),
-        "balanced": mean_interval(by.mean(right)),
+        "accuracy": by.interval(by.over_all(right), "share"),
+        "balanced": by.interval(by.mean(right), "share"),
         "behind": behind,
         "by_floor": {name: float(by.on(right, k)[0]) for k, name in enumerate(by.names)},
         "log_score": float(np.mean(np.log(np.maximum([a.probability for a in answers], 1e-6)))),

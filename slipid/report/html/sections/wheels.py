@@ -1,10 +1,21 @@
 """Sections about wheels and motors: currents before and after the fit, loads, and slip curves."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from slipid.infer.slip_curves import slip_sentence
+from slipid.infer.verdicts.disputed import LoadComparison, sensitivity
 from slipid.report.html import figures as draw
-from slipid.report.html.blocks import Block, DrawingBlock, FigureBlock, PageSection, label
+from slipid.report.html.blocks import (
+    Block,
+    DrawingBlock,
+    FigureBlock,
+    PageSection,
+    TableBlock,
+    TextBlock,
+    label,
+)
 from slipid.report.html.evidence import FitEvidence, WheelLayout
 from slipid.report.html.results import Results
 from slipid.support.content import Content
@@ -67,7 +78,33 @@ def loads(found: Results) -> PageSection | None:
         if name == path or e["interval90"] is None:
             continue
         blocks.append(_robot(evidence.wheels, name, e))
+    if blocks and found.fit is not None:
+        blocks += _comparisons(found.fit.get("load_comparisons", ()))
     return PageSection("loads", "Weight on the wheels", blocks) if blocks else None
+
+
+def _comparisons(content: Sequence[Content]) -> list[Block]:
+    """Return which differences of the loads between floors were found, or would have been."""
+    found = [LoadComparison.of_json(one) for one in content]
+    if not found:
+        return []
+    wheels = [f"wheel {k + 1}, %" for k in range(len(found[0].smallest))]
+    head = ("floors", "disputed", "difference found, standard errors", *wheels)
+    rows = [
+        (
+            " and ".join(one.floors),
+            "yes" if one.disputed else "no",
+            f"{one.standard_errors:.1f}",
+            *(f"{100 * x:.0f}" for x in one.smallest),
+        )
+        for one in found
+    ]
+    title = "Smallest difference of each wheel's load that would have been reported."
+    text = sensitivity(found)
+    return [
+        TextBlock([f"{text[0].upper()}{text[1:]}."], kind="note"),
+        TableBlock(title, head, rows, right=head[2:], folded=True),
+    ]
 
 
 def _robot(wheels: WheelLayout, name: str, e: Content) -> DrawingBlock:
