@@ -42,7 +42,7 @@ def world(tmp_path_factory) -> dict:
     names: dict = {"angle": [0.0, 0.1, 0.2], "amps": [0.3, 0.1, 0.4]}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        few = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
+        few = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3, rows=200)
         patch.setattr(blocks, "Plan", lambda seed, most: replace(few, seed=seed))
         patch.setattr(
             sample, "sampled", lambda fit, plan, draws, *rest: around(fit, plan, 16, *rest)

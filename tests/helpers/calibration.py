@@ -27,7 +27,7 @@ from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 from tests.helpers.made_windows import made, robot
 
-PLAN = Plan(ensembles=2, walkers=16, block=10, warm_up=(2, 4, 6, 8), most=14)
+PLAN = Plan(ensembles=2, walkers=16, block=10, warm_up=(1, 2, 4, 6), most=12, rows=600)
 DRAWS = 50
 """Of each of the plan's ensembles."""
 CENTRE = {

@@ -106,7 +106,9 @@ class Learner:
                 turns = [k for k in range(1, len(of_family)) for _ in range(max(2, calls // 4))]
                 for k in [*turns, *[0] * calls]:
                     keys = jax.random.split(jax.random.key(random.integers(2**31)), len(x))
-                    ends = partial(wander, surrogate, family=of_family[k], step=float(step[k]))
+                    ends = partial(
+                        wander, surrogate, family=of_family[k], step=float(step[k]), bounded=1.0
+                    )
                     found = list(pool.map(lambda x, key, ends=ends: ends(x=x, key=key), x, keys))
                     x = np.stack([np.asarray(f.x) for f in found])
                     drawn.append(x.reshape(-1, target.size))

@@ -31,8 +31,10 @@ ALONE_SHARE = 0.5
 """Fraction of coordinate walks along a coordinate of x; others are along one of the Gaussian."""
 TRAJECTORIES, LENGTH = 4, 10
 """Number of trajectories that make a Hamiltonian move, and of leapfrog steps in each."""
-SHORTEST = 0.6
-"""Ratio of the shortest to the longest leapfrog step: steps of equal length could resonate."""
+SHORTEST, RARITY = 0.1, 4.0
+"""Ratio of the shortest to the longest leapfrog step, and power that makes short ones rare.
+
+Short steps are for walkers in steep parts of the density, and steps of equal length resonate."""
 
 
 class Family(NamedTuple):
@@ -219,6 +221,7 @@ def wander(
     family: Family,
     step: float | Float[Array, ""],
     key: Array,
+    bounded: float = 0.0,
 ) -> Wandered:
     """Return the ends of `TRAJECTORIES` Hamiltonian trajectories that start at x.
 
@@ -228,6 +231,8 @@ def wander(
         family: coordinates that move, and their blocks.
         step: length of the longest leapfrog step, in standard coordinates.
         key: random key.
+        bounded: 1 to keep the walkers in the range of plausible rows, which is needed if the exact
+            density does not accept the ends; else 0.
     """
     # There are columns for as many blocks as there may be, so that families share this function.
     index = np.arange(len(surrogate.groups) + 1)
@@ -235,13 +240,14 @@ def wander(
     free, used = jnp.sum(onto, axis=1), jnp.max(onto, axis=0)
 
     def at(u: Array, p: Array) -> _Phase:
-        found = surrogate.with_slope(jnp.asarray(surrogate.centre + u @ surrogate.root.T))
+        found = surrogate.with_slope(jnp.asarray(surrogate.centre + u @ surrogate.root.T), bounded)
         return _Phase(u, p, found.value @ of_term, found.slope @ surrogate.root * free)
 
     def trajectory(start: _Phase, key: Array) -> tuple[_Phase, Array]:
         of_momentum, of_step, of_end = jax.random.split(key, 3)
         start = start._replace(p=jax.random.normal(of_momentum, start.u.shape) * free)
-        h = step * jax.random.uniform(of_step, start.value.shape, minval=SHORTEST) @ onto.T
+        rare = jax.random.uniform(of_step, start.value.shape) ** RARITY
+        h = step * SHORTEST**rare @ onto.T
 
         def leap(now: _Phase, _: None) -> tuple[_Phase, None]:
             half = now.p + 0.5 * h * now.slope

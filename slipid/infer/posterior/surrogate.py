@@ -38,10 +38,10 @@ UPPER_END = 2.0
 """Distance of log q above the mean of x [std]."""
 PLAUSIBLE = 12.0
 """Loss of log density, beyond the usual one, up to which a row is plausible."""
-MARGIN, EDGE = 0.3, 0.05
+MARGIN, EDGE = 0.5, 0.05
 """Margin around the range of plausible rows, and width of its edge, as fractions of the range.
 
-Beyond, polynomials could have other modes."""
+Beyond, polynomials may have modes that do not exist."""
 RIDGE = 1e-8
 """Ridge penalty of the polynomials' coefficients, for features of unit mean square."""
 DISTANCE = 10.0
@@ -105,10 +105,11 @@ class GroupSurrogate(NamedTuple):
     square: Float[np.ndarray, "component v v"]
     rest: Float[np.ndarray, ""]
 
-    def with_slope(self, x: Array) -> "ValueAndSlope":
+    def with_slope(self, x: Array, bounded: Array | float) -> "ValueAndSlope":
         """Return the approximate log likelihood of every walker, and its slope.
 
-        Polynomials are evaluated in single precision, which is fast and precise to 1e-4.
+        Polynomials are evaluated in single precision, which is fast and precise to 1e-4. The
+        factor `bounded` is 1 to reduce the value outside the range of plausible rows, else 0.
         """
         v, onto_x = jax.vjp(lambda x: self.inputs.all(x).astype(jnp.float32), x)
         constant, linear, square = (
@@ -119,7 +120,7 @@ class GroupSurrogate(NamedTuple):
         value = y[:, -1] - 0.5 * jnp.sum(y[:, :-1] ** 2, axis=1)
         by_y = jnp.concatenate([-y[:, :-1], jnp.ones_like(y[:, -1:])], axis=1)
         by_v = jnp.einsum("wq,wqa->wa", by_y, linear + 2 * bent)  # as C is symmetric
-        outside, back = jax.vjp(self.inputs.outside, x)
+        outside, back = jax.vjp(lambda x: bounded * self.inputs.outside(x), x)
         slope = onto_x(by_v)[0] - back(jnp.ones_like(outside))[0]
         return ValueAndSlope(value - 0.5 * self.rest - outside, slope)
 
@@ -150,14 +151,14 @@ class Surrogate(NamedTuple):
     centre: Float[np.ndarray, " size"]
     root: Matrix
 
-    def with_slope(self, x: Array) -> ValueAndSlope:
+    def with_slope(self, x: Array, bounded: Array | float = 0.0) -> ValueAndSlope:
         """Return the approximate terms of the log density, and the slope of their sum.
 
-        There is one term per group, then the shared term.
+        There is one term per group, then the shared term. `bounded` is that of `GroupSurrogate`.
         """
         own = self.group[:, None] == np.append(np.arange(len(self.groups)), -1)
         pull = (x - self.prior_mean) / self.prior_std
-        of_groups = [g.with_slope(x) for g in self.groups]
+        of_groups = [g.with_slope(x, bounded) for g in self.groups]
         terms = -0.5 * pull**2 @ own.astype(float)
         terms = terms.at[:, :-1].add(jnp.stack([of.value for of in of_groups], axis=1))
         return ValueAndSlope(terms, sum((of.slope for of in of_groups), -pull / self.prior_std))

@@ -70,11 +70,11 @@ def test_slopes_are_those_of_the_values():
     x[0] += 30.0  # outside the range of plausible rows
 
     def value(x):
-        return np.asarray(surrogate.with_slope(jnp.asarray(x)).value).sum(axis=1)
+        return np.asarray(surrogate.with_slope(jnp.asarray(x), 1.0).value).sum(axis=1)
 
     step = 1e-2 * np.eye(2)
     numeric = np.stack([(value(x + s) - value(x - s)) / 2e-2 for s in step], axis=1)
-    slope = np.asarray(surrogate.with_slope(jnp.asarray(x)).slope)
+    slope = np.asarray(surrogate.with_slope(jnp.asarray(x), 1.0).slope)
     np.testing.assert_allclose(slope, numeric, rtol=0.02, atol=0.3)
     assert value(x)[0] < value(x)[1:].min() - 1e4
 
