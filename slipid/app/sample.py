@@ -90,6 +90,8 @@ def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
             "r_hat": float(np.max(d.r_hat)),
             "steps_per_tau": float(d.steps / np.max(d.tau)),
             "effective_draws": float(np.min(d.ess)),
+            "bulk_draws": float(np.min(d.bulk)),
+            "tail_draws": float(np.min(d.tail)),
         },
         "coordinates": {
             name: {"r_hat": float(r), "tau": float(t), "effective_draws": float(n)}

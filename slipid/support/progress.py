@@ -95,8 +95,8 @@ class Reporter:
         stage.
 
         Args:
-            done, total: finished and total amount of work in any unit; the total is constant
-                throughout a stage.
+            done, total: finished and total amount of work in any unit; the total may be estimated
+                anew during a stage.
             what: text about the progress, `done of total` by default.
         """
         if self._task is None:

@@ -33,6 +33,7 @@ class LogDensity:
     coordinates, with whitened residuals y and a remainder c.
 
     Attributes:
+        names: name of each coordinate.
         terms: function from vectors (walker, size) to the terms (walker, group + 1).
         rows: function from vectors and a group to y (walker, row) and c (walker,).
         depends: True where the residuals of a group depend on a coordinate.
@@ -42,6 +43,7 @@ class LogDensity:
         centre, covariance: mean and covariance of the Laplace approximation.
     """
 
+    names: tuple[str, ...]
     terms: Callable[[Matrix], Matrix]
     rows: Callable[[Matrix, int], tuple[Matrix, Float[np.ndarray, " walker"]]]
     depends: Bool[np.ndarray, "group size"]

@@ -141,6 +141,7 @@ class Density:
         space, at = self.problem.space, self.structure
         floors = np.arange(len(self.floors))[:, None]
         return LogDensity(
+            names=self.names,
             terms=self.terms,
             rows=self.rows,
             depends=self.touched | (self.group == floors),

@@ -4,6 +4,7 @@ The module does not import the sampler; modules for showing, deploying and writi
 loaded by the methods that need them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -38,20 +39,37 @@ class Diagnosis:
     Attributes:
         r_hat: rank-normalised split R-hat over ensembles (Vehtari et al. 2021).
         tau: integrated autocorrelation time [step].
-        ess: effective number of draws, the smaller of those for the bulk and for the tails.
+        bulk, tail: effective number of draws for the bulk, and for the 5 % and 95 % quantiles.
         steps: number of steps of every walker after the warm-up.
         converged: True if every coordinate meets the criteria of the plan.
         worst: index of the coordinate that is furthest from meeting a criterion.
         reason: value of that criterion for this coordinate, as a string.
+        excess: ratio of the steps that this criterion needs to those that were made.
     """
 
     r_hat: Float[np.ndarray, " size"]
     tau: Float[np.ndarray, " size"]
-    ess: Float[np.ndarray, " size"]
+    bulk: Float[np.ndarray, " size"]
+    tail: Float[np.ndarray, " size"]
     steps: int
     converged: bool
     worst: int
     reason: str
+    excess: float
+
+    @property
+    def ess(self) -> Float[np.ndarray, " size"]:
+        """Effective number of draws: the smaller of `bulk` and `tail`."""
+        return np.minimum(self.bulk, self.tail)
+
+    def against(self, plan: Plan, names: Sequence[str]) -> str:
+        """Return the values of the worst coordinates and those that the plan asks for."""
+        least = int(np.argmin(self.ess))
+        return (
+            f"R-hat {self.r_hat.max():.4f} (< {plan.r_hat}), {names[least]}: "
+            f"{self.bulk[least]:.0f} effective draws of its bulk and {self.tail[least]:.0f} of its "
+            f"tails (> {plan.least_draws:.0f})"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,10 +185,9 @@ def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
     by_ensemble = chain.reshape(ensembles, steps * walkers, size)
     by_walker = chain.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, size)
     r_hat = array_stats.rhat(by_ensemble, chain_axis=0, draw_axis=1, method="rank")
-    ess = np.minimum(
-        array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="bulk"),
-        array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="tail", prob=(0.05, 0.95)),
-    )
+    bulk = array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="bulk")
+    tail = array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="tail", prob=(0.05, 0.95))
+    ess = np.minimum(bulk, tail)
     criteria = [
         (np.nan_to_num(r_hat - 1, nan=np.inf) / (plan.r_hat - 1), r_hat, "R-hat {:.4f}"),
         (plan.steps_per_tau * tau / steps, steps / tau, "{:.0f} steps per autocorrelation time"),
@@ -180,7 +197,17 @@ def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
     worst = int(np.argmax(excess))
     converged = bool(excess[worst] < 1)
     reason = text.format(values[worst])
-    return Diagnosis(np.asarray(r_hat), tau, np.asarray(ess), steps, converged, worst, reason)
+    return Diagnosis(
+        r_hat=np.asarray(r_hat),
+        tau=tau,
+        bulk=np.asarray(bulk),
+        tail=np.asarray(tail),
+        steps=steps,
+        converged=converged,
+        worst=worst,
+        reason=reason,
+        excess=float(excess[worst]),
+    )
 
 
 def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:

@@ -36,6 +36,8 @@ from slipid.support.progress import Reporter
 
 RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister in NumPy's form."""
+USUAL_BLOCKS = 24
+"""Number of blocks after the warm-up that are usually sufficient."""
 
 
 def extended(
@@ -51,32 +53,40 @@ def extended(
     if checkpoint and blocks:
         report.line(f"continuing from block {len(blocks)} ({part}) of {checkpoint.folder}")
     report.stage(f"sampling {part}")
-    learner = Learner(target, plan)
-    while not _ended(blocks, plan):
+    learner, found = Learner(target, plan), _diagnosed(blocks, plan)
+    while not (len(blocks) >= plan.most or (found and found.converged)):
         block = _block(learner, blocks)
         blocks.append(block)
         if checkpoint:
             checkpoint.save(f"{part}-{block.number:04d}", packed(block))
-        warm = "warm-up, " if len(blocks) <= plan.warm_up[-1] else ""
-        what = (
-            f"block {len(blocks)}: {warm}{len(blocks) * plan.block} steps, "
-            f"{100 * block.accepted.mean():.0f} % moved, "
-            f"log density {block.log_prob[:, -1].mean():.1f}"
-        )
-        # The block at which sampling converges is unknown, so the remaining time is estimated for
-        # the limit of blocks.
-        report.advance(len(blocks), plan.most, what)
+        found = _diagnosed(blocks, plan) or found
+        what = f"block {len(blocks)}: {100 * block.accepted.mean():.0f} % moved"
+        if len(blocks) <= plan.warm_up[-1]:
+            what += f", warm-up, log density {block.log_prob[:, -1].mean():.1f}"
+        elif found:
+            what += f", {found.against(plan, target.names)}"
+        report.advance(len(blocks), _expected(len(blocks), found, plan), what)
     return blocks
 
 
-def _ended(blocks: list[ChainBlock], plan: Plan) -> bool:
+def _diagnosed(blocks: list[ChainBlock], plan: Plan) -> diagnosis.Diagnosis | None:
+    """Return the convergence so far if it is to be judged after this number of blocks."""
     after = len(blocks) - plan.warm_up[-1]
-    if len(blocks) >= plan.most:
-        return True
     # The check is slow, so it is done for every fourth block at first, and later less often.
     if after < 4 or after % max(4, 2 ** int(np.log2(after) - 3)):
-        return False
-    return diagnosis.diagnose(chain(blocks, plan), plan).converged
+        return None
+    return diagnosis.diagnose(chain(blocks, plan), plan)
+
+
+def _expected(done: int, found: diagnosis.Diagnosis | None, plan: Plan) -> int:
+    """Return the number of blocks after which the chains will probably have converged.
+
+    Effective draws grow in proportion to the steps.
+    """
+    after = USUAL_BLOCKS
+    if found:
+        after = int(found.excess * found.steps / plan.block) + 1
+    return min(plan.most, max(done + 1, plan.warm_up[-1] + after))
 
 
 def chain(blocks: Sequence[ChainBlock], plan: Plan) -> Chain:

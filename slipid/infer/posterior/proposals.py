@@ -221,7 +221,7 @@ def wander(
     family: Family,
     step: float | Float[Array, ""],
     key: Array,
-    bounded: float = 0.0,
+    bounded: float | Float[Array, ""] = 0.0,
 ) -> Wandered:
     """Return the ends of `TRAJECTORIES` Hamiltonian trajectories that start at x.
 

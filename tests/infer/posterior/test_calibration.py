@@ -92,7 +92,6 @@ def test_electric_draws_that_never_moved_prevent_convergence(whole, monkeypatch)
 def whole():
     """Return an experiment, with blocks and draws of its posterior."""
     fit, _ = calibration.experiment(12)
-    # as many walkers as in test_chain.py, for which the densities are compiled
     plan = Plan(ensembles=2, walkers=6, block=5, warm_up=(1, 2), most=4, rows=200)
     blocks = Memory()
     found = posterior.sampled(fit, plan, 10, blocks, QUIET)

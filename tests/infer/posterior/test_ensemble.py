@@ -37,7 +37,10 @@ def known(residuals, group, centre, covariance, prior=None, positive=()):
 
     depends = (group == np.arange(groups)[:, None]) | (group < 0)
     of_positive = np.isin(np.arange(size), positive)
-    return LogDensity(terms, residuals, depends, group, of_positive, mean, std, centre, covariance)
+    names = tuple(f"x{k}" for k in range(size))
+    return LogDensity(
+        names, terms, residuals, depends, group, of_positive, mean, std, centre, covariance
+    )
 
 
 def gaussian():
