@@ -29,12 +29,15 @@ OF_ALL = 0.7
 """Fraction of moves that change all coordinates, if groups share some."""
 ALONE_SHARE = 0.5
 """Fraction of coordinate walks along a coordinate of x; others are along one of the Gaussian."""
-TRAJECTORIES, LENGTH = 4, 10
+TRAJECTORIES, LENGTH = 2, 20
 """Number of trajectories that make a Hamiltonian move, and of leapfrog steps in each."""
 SHORTEST, RARITY = 0.1, 4.0
 """Ratio of the shortest to the longest leapfrog step, and power that makes short ones rare.
 
 Short steps are for walkers in steep parts of the density, and steps of equal length resonate."""
+
+TEMPERATURE = 1.3
+"""Factor by which a density is flatter from which surrogates are learnt, for its tails."""
 
 
 class Family(NamedTuple):
@@ -221,7 +224,7 @@ def wander(
     family: Family,
     step: float | Float[Array, ""],
     key: Array,
-    bounded: float | Float[Array, ""] = 0.0,
+    learning: float | Float[Array, ""] = 0.0,
 ) -> Wandered:
     """Return the ends of `TRAJECTORIES` Hamiltonian trajectories that start at x.
 
@@ -231,8 +234,8 @@ def wander(
         family: coordinates that move, and their blocks.
         step: length of the longest leapfrog step, in standard coordinates.
         key: random key.
-        bounded: 1 to keep the walkers in the range of plausible rows, which is needed if the exact
-            density does not accept the ends; else 0.
+        learning: 1 for a density that is wider by `TEMPERATURE` and bounded by the range of
+            plausible rows, from which the next surrogate is learnt; else 0.
     """
     # There are columns for as many blocks as there may be, so that families share this function.
     index = np.arange(len(surrogate.groups) + 1)
@@ -240,8 +243,11 @@ def wander(
     free, used = jnp.sum(onto, axis=1), jnp.max(onto, axis=0)
 
     def at(u: Array, p: Array) -> _Phase:
-        found = surrogate.with_slope(jnp.asarray(surrogate.centre + u @ surrogate.root.T), bounded)
-        return _Phase(u, p, found.value @ of_term, found.slope @ surrogate.root * free)
+        found = surrogate.with_slope(jnp.asarray(surrogate.centre + u @ surrogate.root.T), learning)
+        cool = 1 + learning * (1 / TEMPERATURE - 1)
+        return _Phase(
+            u, p, cool * found.value @ of_term, cool * found.slope @ surrogate.root * free
+        )
 
     def trajectory(start: _Phase, key: Array) -> tuple[_Phase, Array]:
         of_momentum, of_step, of_end = jax.random.split(key, 3)
