@@ -29,8 +29,6 @@ from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "robotino2022.toml"
-OWN = "slipid.infer.posterior.proposals"
-"""Its degrees are of proposals of a sampler."""
 
 
 def likelihood(problem: Problem, end: Optimum, degrees: float) -> dict[str, float]:
@@ -53,7 +51,7 @@ def likelihood(problem: Problem, end: Optimum, degrees: float) -> dict[str, floa
 @pytest.mark.parametrize("degrees", quick([4.0, 8.0, 16.0, 100.0], [8.0]))
 def test_degrees(degrees: float, real_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, module in list(sys.modules.items()):
-        if name.startswith("slipid.") and name != OWN and hasattr(module, "DEGREES"):
+        if name.startswith("slipid.") and hasattr(module, "DEGREES"):
             monkeypatch.setattr(module, "DEGREES", degrees)
     jax.clear_caches()  # compiled functions have the degrees in them
     job = read_fit_task(read_config(CONFIG), real_data / "robotino2022", Reporter())

@@ -3,8 +3,7 @@
 All three see the motion part of the same posterior (2022 logs of one floor, what runs share
 marginalised) and begin at its Laplace approximation, whose covariance NUTS has as its metric. emcee
 has its default move and the same likelihood in vectorised numpy. Time is that of sampling after the
-warm-up; reading, fitting and compiling are left out. Whether they agree is asked of NUTS in the
-coordinates that slipid has learnt, too, where it has enough effective draws to say.
+warm-up; reading, fitting and compiling are left out.
 """
 
 from __future__ import annotations
@@ -79,19 +78,17 @@ def ess_of(chain):
 
 
 def by_slipid(density):
-    """Chains (chain, draw, coordinate), seconds of sampling and of the warm-up, the last block."""
+    """Chains (chain, draw, coordinate), seconds of sampling and of the warm-up."""
     from slipid.infer.posterior import ensemble as sampler
-    from slipid.infer.posterior.blocks import LogDensity, Plan
+    from slipid.infer.posterior.blocks import Plan
     from slipid.infer.posterior.coordinates import MOTION
     from slipid.infer.posterior.diagnosis import diagnose
     from slipid.support.progress import Reporter
 
-    d = density
-    target = LogDensity(d.terms, d.slope, d.group, d.centre, d.covariance)
-    few = Plan(ensembles=2, walkers=16, block=10, warm_up=(2, 4, 6, 8), most=14)
+    d, target = density, density.target()
+    few = Plan(ensembles=2, walkers=16, block=10, warm_up=(1, 2), most=7, rows=200)
     plan = quick(Plan(), few)
-    x = np.repeat(d.centre[None], plan.walkers, axis=0)
-    d.terms(x), d.slope(x)  # compiles
+    d.terms(d.centre[None])  # compiles
     times, report = [time.perf_counter()], Reporter(quiet=True)
     report.advance = lambda *_: times.append(time.perf_counter())
     blocks = sampler.extended(target, plan, MOTION, None, report)
@@ -100,25 +97,15 @@ def by_slipid(density):
     found = diagnose(chain, plan)
     print(f"slipid: {found.steps} steps, R-hat {found.r_hat.max():.4f}, {found.converged=}")
     walkers = chain.transpose(0, 2, 1, 3).reshape(-1, chain.shape[1], d.size)
-    return walkers, times[-1] - times[warm], times[warm] - times[0], blocks[-1]
+    return walkers, times[-1] - times[warm], times[warm] - times[0]
 
 
-def by_nuts(path, block=None):
-    """The same by numpyro, each chain in a process of its own, side by side.
-
-    Args:
-        block: through whose map; None for the Gaussian one of the Laplace approximation.
-    """
-    from slipid.infer.posterior.blocks import packed
-
+def by_nuts(path):
+    """The same by numpyro, each chain in a process of its own, side by side."""
     files = [path.with_name(f"nuts{k}.npz") for k in range(CHAINS)]
-    words = []
-    if block is not None:
-        words = [str(path.with_name("block.npz"))]
-        np.savez(words[0], **packed(block))
     command, env = [sys.executable, __file__, str(path)], os.environ | {"PYTHONPATH": str(ROOT)}
     runs = [
-        subprocess.Popen([*command, str(k), str(file), *words], cwd=ROOT, env=env)
+        subprocess.Popen([*command, str(k), str(file)], cwd=ROOT, env=env)
         for k, file in enumerate(files)
     ]
     assert [run.wait() for run in runs] == [0] * CHAINS
@@ -127,27 +114,18 @@ def by_nuts(path, block=None):
     return np.stack([m["x"] for m in made]), seconds, max(float(m["warm_up"]) for m in made)
 
 
-def nuts(path, seed, out, block=None):
-    """One chain of NUTS."""
+def nuts(path, seed, out):
+    """One chain of NUTS in coordinates in which the Laplace approximation is standard."""
     import jax
     import jax.numpy as jnp
     from numpyro.infer import MCMC, NUTS
-    from slipid.infer.posterior.transport_map import _placed, gaussian
-
-    from slipid.infer.posterior.blocks import unpacked
 
     d = density = density_of(problem_of(FLOOR), pickle.loads(Path(path).read_bytes()))
-    map = gaussian(d.centre, d.covariance, d.group)
-    if block is not None:
-        with np.load(block) as kept:
-            map = unpacked(dict(kept)).map
-
-    steps = map._on_device
+    root = np.linalg.cholesky(d.covariance)
 
     @jax.jit
     def potential(u):
-        x, log = _placed(steps, u[None])
-        return -jnp.sum(density.sums(density.anchor, x[0], None)) - jnp.sum(log)
+        return -density.log_prob(density.anchor, d.centre + root @ u, None)
 
     kernel = NUTS(potential_fn=potential, dense_mass=False)
     chain = MCMC(kernel, num_warmup=NUTS_WARM_UP, num_samples=NUTS_DRAWS, progress_bar=False)
@@ -159,7 +137,7 @@ def nuts(path, seed, out, block=None):
     chain.run(chain.post_warmup_state.rng_key)
     u = np.asarray(chain.get_samples())
     seconds = time.perf_counter() - warm
-    np.savez(out, x=map.placed(u)[0], seconds=seconds, warm_up=warm - began)
+    np.savez(out, x=d.centre + u @ root.T, seconds=seconds, warm_up=warm - began)
 
 
 def by_stretch(density, draws):
@@ -209,8 +187,8 @@ def test_agreement_and_speed(fitted):
     problem, found, path = fitted
     density = density_of(problem, found)
     print(f"\n{FLOOR}: {len(problem.windows)} pieces, {density.size} coordinates")
-    *ours, block = by_slipid(density)
-    rows = {"slipid": ours, "NUTS": by_nuts(path), "NUTS through the map": by_nuts(path, block)}
+    ours = by_slipid(density)
+    rows = {"slipid": ours, "NUTS": by_nuts(path)}
     speed, flat = {}, ours[0].reshape(-1, density.size)
     for name, (chain, took, before) in rows.items():
         ess, other = ess_of(chain), chain.reshape(-1, density.size)
@@ -239,4 +217,4 @@ def test_agreement_and_speed(fitted):
 
 
 if __name__ == "__main__":
-    nuts(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])
+    nuts(sys.argv[1], int(sys.argv[2]), sys.argv[3])

@@ -264,7 +264,7 @@ class Density:
 
 _BATCH = 4
 """Number of vectors that are evaluated together."""
-_STEPS, _PROPOSALS = 4, 16
+_STEPS, _PROPOSALS = 4, 256
 """Numbers of Gauss-Newton steps and of proposals for every draw of the motion."""
 _DEGREES = 5.0
 """Degrees of freedom of the Student t from which electric parameters are proposed."""
