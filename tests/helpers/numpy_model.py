@@ -273,10 +273,12 @@ class Posterior:
         v = self.numbers(z)
         xi, _ = self.rival.twist(v, self.twist + self.slope @ (z - self.z))
         white = np.einsum("nij,nj->ni", self.root, self.rival.motion(v, xi))
-        told = (white**2).sum()
+        squares = (white**2).sum()
         for pieces, rows, factor in self.tied:  # what shared effects explain
-            told -= (solve_triangular(factor, white[pieces].ravel() @ rows, lower=True) ** 2).sum()
-        total = -0.5 * told - 0.5 * (((x - self.mean) / self.std) ** 2).sum()
+            squares -= (
+                solve_triangular(factor, white[pieces].ravel() @ rows, lower=True) ** 2
+            ).sum()
+        total = -0.5 * squares - 0.5 * (((x - self.mean) / self.std) ** 2).sum()
         total += self.factor * self.camera(v)
         return total if np.isfinite(total) else -np.inf
 
