@@ -507,7 +507,7 @@ def test_a_posterior_that_has_converged_is_0_and_takes_its_blocks_away(
     monkeypatch.setattr(
         diagnosis, "diagnose", lambda chain, plan: replace(found(chain, plan), converged=True)
     )
-    monkeypatch.setattr(posterior, "MOST_UNMOVED", 1.0)
+    monkeypatch.setattr(posterior, "MOST_REFUSED", 1.0)
     result = invoke("sample", out, *FEW)
     assert result.exit_code == 0, result.output
     assert "converged: worst is" in result.stdout

@@ -15,9 +15,9 @@ share some coordinates and have others of their own, so that the log posterior i
 and moves of the parameters of several floors can be proposed in one evaluation and accepted floor
 by floor.
 
-Electric numbers are drawn for every draw of the motion. Gauss-Newton steps find their most likely
-values given the motion, and proposals come from a Student t around them, whose tails cover those
-of a skewed density. Each proposal is accepted or rejected by the exact density (Metropolis-Hastings
+Electric numbers are drawn for every draw of the motion. Damped Gauss-Newton steps (Levenberg and
+Marquardt) find their most likely values given the motion, and proposals come from a Student t
+around them, whose tails cover those of a skewed density. Each proposal is accepted or rejected by the exact density (Metropolis-Hastings
 with independent proposals; Tierney 1994, Annals of Statistics 22(4)).
 """
 
@@ -251,8 +251,13 @@ class Density:
 
 _BATCH = 4
 """Number of vectors that are evaluated together."""
-_STEPS, _PROPOSALS = 4, 256
-"""Numbers of Gauss-Newton steps and of proposals for every draw of the motion."""
+_STEPS, _PROPOSALS = 10, 96
+"""Numbers of Levenberg-Marquardt steps and of proposals for every draw of the motion."""
+_FIRST_DAMPING, _DAMPING_RATIO = 1e-3, 10.0
+"""Damping of the first step, relative to the information, and its ratio from step to step.
+
+Undamped, steps along the logarithm of a small parameter overshoot, and proposals around their end
+miss most of the density."""
 _DEGREES = 5.0
 """Degrees of freedom of the Student t from which electric parameters are proposed."""
 _SCALE_RATIO = 1.15
@@ -273,7 +278,7 @@ def electric_given_motion(
     Args:
         first: density of the motion.
         second: density of the electric parameters given the motion.
-        covariance: Laplace covariance of the search vector; Gauss-Newton steps start at its
+        covariance: Laplace covariance of the search vector; the steps start at its
             regression of electric parameters on those of the motion.
         x: draws of the motion.
         seed: seed of the proposals.
@@ -293,12 +298,20 @@ def electric_given_motion(
     return np.asarray(drawn).reshape(*x.shape[:2], -1), np.asarray(moved)
 
 
+class _Climb(NamedTuple):
+    """Electric parameters on the way to their most likely values, their density and the damping."""
+
+    x: Float[Array, " electric"]
+    value: Float[Array, ""]
+    damping: float | Float[Array, ""]
+
+
 def _draw(
     density: Density, anchor: Anchor, held: HeldMotion, start: Array, student: Array, chance: Array
 ) -> tuple[Array, Array]:
     """Return the last accepted proposal, and a mask of the accepted proposals.
 
-    `start` is the start of the Gauss-Newton steps, `student` has standard draws of a Student t, and
+    `start` is the start of the Levenberg-Marquardt steps, `student` has standard draws of a Student t, and
     `chance` has logarithms of uniform random numbers.
     """
 
@@ -309,12 +322,18 @@ def _draw(
         slope = jax.jacfwd(lambda x: density.whitened(anchor, x, held).rows)(x)
         return slope.T @ slope + jnp.diag(1 / anchor.prior_std[density.structure] ** 2)
 
-    def step(x: Array, _: None) -> tuple[Array, None]:
-        return x + jnp.linalg.solve(information(x), jax.grad(log_prob)(x)), None
+    def step(now: _Climb, _: None) -> tuple[_Climb, None]:
+        x, value, damping = now
+        of_x = information(x)
+        damped = of_x + damping * jnp.diag(jnp.diag(of_x))
+        new = x + jnp.linalg.solve(damped, jax.grad(log_prob)(x))
+        better = (above := log_prob(new)) > value  # False for nan
+        damping = jnp.where(better, damping / _DAMPING_RATIO, damping * _DAMPING_RATIO)
+        return _Climb(jnp.where(better, new, x), jnp.where(better, above, value), damping), None
 
-    found, _ = jax.lax.scan(step, start, None, length=_STEPS)
-    # Divergent steps end in nan; proposals are then made around the start, and few are accepted.
-    centre = jnp.where(jnp.all(jnp.isfinite(found)), found, start)
+    at_start = log_prob(start)
+    first = _Climb(start, jnp.where(jnp.isfinite(at_start), at_start, -jnp.inf), _FIRST_DAMPING)
+    centre = jax.lax.scan(step, first, None, length=_STEPS)[0].x
     root = jnp.linalg.cholesky(jnp.linalg.inv(information(centre)))
     at = centre + _SCALE_RATIO * student @ root.T
     tail = 0.5 * (_DEGREES + len(start)) * jnp.log1p(jnp.sum(student**2, axis=1) / _DEGREES)

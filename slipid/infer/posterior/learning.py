@@ -111,7 +111,8 @@ class Learner:
                 # all coordinates last, whose draws spread furthest
                 turns = [k for k in range(1, len(of_family)) for _ in range(max(2, calls // 4))]
                 for k in [*turns, *[0] * calls]:
-                    keys = jax.random.split(jax.random.key(random.integers(2**31)), len(x))
+                    key = jax.random.key(random.integers(2**31))
+                    keys = jax.random.split(key, (len(x), 1))
                     ends = partial(
                         wander,
                         surrogate,
@@ -119,7 +120,7 @@ class Learner:
                         step=float(step[k]),
                         learning=1.0,
                     )
-                    found = list(pool.map(lambda x, key, ends=ends: ends(x=x, key=key), x, keys))
+                    found = list(pool.map(lambda x, k, ends=ends: ends(x=x, keys=k), x, keys))
                     x = np.stack([np.asarray(f.x) for f in found])
                     drawn.append(x.reshape(-1, target.size))
                     off = np.mean([float(f.followed) for f in found]) - TARGET_FOLLOWED

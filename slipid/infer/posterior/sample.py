@@ -35,8 +35,11 @@ from slipid.support.checkpoint import Checkpoint
 from slipid.support.files import write_bytes
 from slipid.support.progress import COMPILING_S, Reporter
 
-MOST_UNMOVED = 0.01
-"""Largest tolerated fraction of draws whose electric parameters have no accepted proposal."""
+LEAST_ACCEPTED, MOST_REFUSED = 0.05, 0.1
+"""Smallest accepted fraction of the proposals for the electric parameters of one draw, and largest
+tolerated fraction of draws that accept fewer.
+
+Where few are accepted, proposals miss a part of the density, however many are made."""
 
 
 def sampled(
@@ -58,7 +61,7 @@ def sampled(
     out = np.broadcast_to(fitted.z, (*shape, len(fitted.z))).copy()
     out[..., first.structure] = x
     accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}
-    still, reason = 0.0, f"{found.reason} ({first.names[found.worst]})"
+    refused, reason = 0.0, f"{found.reason} ({first.names[found.worst]})"
     if len(parts) > 1:
         second = Density(problem, fitted, ELECTRIC)
         if second.size:
@@ -66,11 +69,14 @@ def sampled(
             drawn, moved = electric_given_motion(first, second, fitted.covariance, x, plan.seed)
             out[..., second.structure] = drawn
             accepted[ELECTRIC] = float(moved.mean())
-            still = float((~moved.any(axis=1)).mean())
+            refused = float((moved.mean(axis=1) < LEAST_ACCEPTED).mean())
     if not np.isfinite(out).all():
-        still, reason = 1.0, "electric draws that are not finite"
-    elif found.converged and still > MOST_UNMOVED:
-        reason = f"{100 * still:.1f} % of the electric draws, which had no accepted proposal"
+        refused, reason = 1.0, "electric draws that are not finite"
+    elif found.converged and refused > MOST_REFUSED:
+        reason = (
+            f"{100 * refused:.1f} % of the electric draws, which accepted less than "
+            f"{100 * LEAST_ACCEPTED:.0f} % of their proposals"
+        )
     return Posterior(
         fit=fit,
         z=out,
@@ -79,7 +85,7 @@ def sampled(
         names=first.names,
         diagnosis=found,
         accepted=accepted,
-        converged=found.converged and still <= MOST_UNMOVED,
+        converged=found.converged and refused <= MOST_REFUSED,
         reason=reason,
     )
 

@@ -108,6 +108,15 @@ def test_draws_follow_the_motion(usual):
     np.testing.assert_allclose(away, 0.0, atol=4 / np.sqrt(COPIES))
 
 
+def test_steps_towards_the_mode_are_damped():
+    """Undamped steps overshoot along logarithms of small friction: 3 % were accepted."""
+    small = ("viscous_friction", "coulomb_friction", "rolling_drag")
+    first, second, covariance = parts([*FREE, *(Choice(f"motor.{n}", free=True) for n in small)])
+    motion = np.broadcast_to(first.centre + 0.6, (1, 8, first.size))
+    _, moved = electric_given_motion(first, second, covariance, motion, 0)
+    assert moved.mean() > 0.15
+
+
 def test_a_skewed_density_is_drawn_from_exactly():
     """Draws follow a density on a grid that is far from the Gaussian of the proposals."""
     first, second, covariance = parts(
