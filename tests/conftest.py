@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from ctypes import CDLL
 from ctypes.util import find_library
@@ -66,6 +67,19 @@ one_blas_thread()
 # and `make nightly`. Must come before the first import of what computes.
 if os.environ.get("SLIPID_CHECK_TYPES", "1") != "0":
     check_types_of("slipid")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def laplace_intervals() -> Iterator[None]:
+    """Let fits in this process keep their Laplace intervals, since a chain takes ten seconds.
+
+    Fits in processes of their own, such as the demo's, and `test_short_chain` have the chain.
+    """
+    from slipid.app import identify
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identify, "short_chain", lambda *_: None)
+        yield
 
 
 @pytest.fixture

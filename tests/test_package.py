@@ -16,12 +16,12 @@ import slipid
 ROOT = Path(__file__).resolve().parents[1]
 EXTRA = (
     *("matplotlib", "plotly", "jinja2", "rosbags", "pyarrow", "pyulog", "mcap", "cv2", "mujoco"),
-    *("emcee", "arviz_base", "arviz_stats", "arviz_plots", "xarray", "h5netcdf", "h5py", "sklearn"),
+    *("arviz_base", "arviz_stats", "arviz_plots", "xarray", "h5netcdf", "h5py", "sklearn"),
 )
 """Packages that extras install."""
 DRAW_OR_SAMPLE = {
     "slipid.app.sample",
-    *(f"slipid.infer.posterior.{name}" for name in ("ensemble", "learning", "proposals", "sample")),
+    "slipid.infer.posterior.sample",
     *(f"slipid.lab.{name}" for name in ("paper2021.plots", "trial.plots")),
 }
 """Modules outside `slipid.plots` that need such a package: commands look for it before."""

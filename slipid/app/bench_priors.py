@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slipid.app.config import Config
-from slipid.infer.verdicts.estimates import Z95
+from slipid.infer.verdicts.draws import Z95
 from slipid.model.motor import Motor
 from slipid.parameter import Declaration, entries
 from slipid.search_space import Choice

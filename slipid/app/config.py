@@ -373,7 +373,11 @@ class FitSection(Section):
             noise variances.
         tolerance: the fit ends when no parameter changes by more than this fraction of its standard
             deviation in a round.
-        seed: seed of the random draws from which the uncertainty bands of curves are computed.
+        intervals: "sampled" if a short chain of the posterior replaces intervals of the Laplace
+            approximation that it contradicts; "laplace" for the approximation alone, which takes
+            less time.
+        seed: seed of the short chain and of the draws from which the uncertainty bands of curves
+            are computed.
     """
 
     lengths_from: Literal["poses", "wheels"] | None = None
@@ -381,6 +385,7 @@ class FitSection(Section):
     longest_window_s: Positive | None = None
     rounds: int = Field(default=30, ge=1)
     tolerance: Positive = 0.02
+    intervals: Literal["sampled", "laplace"] = "sampled"
     seed: int = Field(default=0, ge=0)
 
 

@@ -20,6 +20,8 @@ from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise, start_rounds
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
+from slipid.infer.posterior.coordinates import Fitted
+from slipid.infer.posterior.short_chain import short_chain
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
@@ -290,6 +292,8 @@ def summarised(
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
         fit = _with_mixed_runs(fit, task, problem, optimum, report)
+    elif fit.converged and task.settings.intervals == "sampled":
+        fit = replace(fit, chain=short_chain(problem, Fitted.of(fit), task.settings.seed, report))
     report.stage("predicting held-out runs")
     contact = contact_errors(task.dataset, problem, optimum, report.steps)
     selection = selected(

@@ -60,8 +60,9 @@ DRAWS = 64
 def deploy(found: Fit | Posterior) -> DeployedRobot:
     """Return the robot of a fit or of its posterior, with its first load set-up.
 
-    Parameters are as in `identified.json`: from the posterior if one is given, else from the fit's
-    Laplace approximation. `DeployedRobot.record.source` tells which.
+    Parameters are as in `identified.json`, and draws are those of the posterior if one is given,
+    else those of the fit's short chain or, without one, of its Laplace approximation.
+    `DeployedRobot.record.source` is the name of the one that was used.
     """
     source: Source
     if isinstance(found, Posterior):
@@ -69,7 +70,8 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
         rows = np.random.default_rng(0).choice(len(flat), DRAWS, replace=len(flat) < DRAWS)
         vectors, center = flat[rows], flat.mean(axis=0)
     else:
-        fit, vectors, center, source = found, found.draws(DRAWS), found.z, "laplace"
+        fit, vectors, center = found, found.draws(DRAWS), found.z
+        source = "laplace" if found.chain is None else "short_chain"
     numbers = found.parameters
     fixed = [Choice(glob.escape(path), fixed=e.value) for path, e in numbers.items()]
     record = _record(

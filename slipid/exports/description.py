@@ -177,6 +177,7 @@ def gains_sentence(robot: DeployedRobot) -> str:
 
 SOURCES: Mapping[Source, str] = {
     "laplace": "a fit to logs (Laplace approximation)",
+    "short_chain": "a fit to logs (draws of a short chain)",
     "posterior": "the posterior of a fit to logs",
     "given": "values given without logs",
 }

@@ -21,6 +21,7 @@ from slipid.fitting.shared_effects import FittedEffects, SpeedAndLoad
 from slipid.infer.held_out import HeldOut
 from slipid.infer.result import Channels, Fit
 from slipid.infer.slip_curves import SlipCurve
+from slipid.infer.verdicts.draws import Draws
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, Validity, build
@@ -103,6 +104,8 @@ def load(folder: Path) -> Fit:
 def _packed(fit: Fit) -> bytes:
     buffer = io.BytesIO()
     arrays = {"covariance": fit.covariance, "laplace": fit.laplace}
+    if fit.chain is not None:
+        arrays |= {"chain": fit.chain.z}
     for floor, found in fit.shared.items():
         arrays |= {f"shared/{floor}/{name}": getattr(found, name) for name in _SHARED}
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
@@ -268,6 +271,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         },
         covariance=arrays["covariance"],
         laplace=arrays["laplace"],
+        chain=Draws(arrays["chain"]) if "chain" in arrays else None,
         **{name: content[name] for name in _PLAIN},
     )
 

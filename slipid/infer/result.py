@@ -24,6 +24,7 @@ from slipid.fitting.variances import Search, Square
 from slipid.infer.held_out import HeldOut, doubted
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import LoadComparison, load_comparisons, marked
+from slipid.infer.verdicts.draws import Draws
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
@@ -121,6 +122,7 @@ class Fit:
         data: runs on one floor each; None for a fit that was loaded from its files.
         problem: likelihood of all fitted runs; None for a loaded fit.
         optimum: result of the optimisation; None for a loaded fit.
+        chain: draws of a short chain around the fit; None without one, or if it has too few.
     """
 
     space: Space
@@ -155,6 +157,7 @@ class Fit:
     data: Runs | None = None
     problem: Problem | None = None
     optimum: Optimum | None = None
+    chain: Draws | None = None
 
     def __str__(self) -> str:
         from slipid.report.estimates import show_fit
@@ -352,7 +355,8 @@ class Fit:
     def parameters(self) -> dict[str, Estimate]:
         """Every parameter, keyed by path, with interval and verdict."""
         volts, flat = self.channels.voltage, members(self.flat)
-        found = estimates(self.verdict_space, self.choices, self.z, self.covariance, volts, flat)
+        known = self.z, self.covariance, volts, flat, self.chain
+        found = estimates(self.verdict_space, self.choices, *known)
         return doubted(marked({e.path: e for e in found}, self.disputes), self.held_out)
 
     @cached_property
@@ -393,7 +397,8 @@ class Fit:
     @cached_property
     def derived(self) -> dict[str, Estimate]:
         """Ratios of parameters, keyed by path; one may be identified even if its parts are not."""
-        found = derived(self.space, self.z, self.covariance, self.channels.voltage)
+        known = self.z, self.covariance, self.channels.voltage
+        found = derived(self.space, *known, chain=self.chain)
         return doubted({e.path: e for e in found}, self.held_out)
 
     @property
@@ -432,7 +437,12 @@ class Fit:
         return hash_of(self.runs)
 
     def draws(self, count: int, seed: int = 0) -> Float[np.ndarray, "draw free"]:
-        return draws(self.z, self.covariance, count, seed)
+        """Return draws of the short chain, or of the Laplace approximation without one."""
+        if self.chain is None:
+            return draws(self.z, self.covariance, count, seed)
+        flat = self.chain.flat
+        rows = np.random.default_rng(seed).choice(len(flat), count, replace=len(flat) < count)
+        return flat[rows]
 
 
 def required(evidence: Evidence | None) -> Evidence:

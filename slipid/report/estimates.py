@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from slipid.infer.bench.verdict import BenchFit
     from slipid.infer.posterior.diagnosis import Posterior
     from slipid.infer.result import Fit
+    from slipid.infer.verdicts.draws import Draws
     from slipid.infer.verdicts.estimates import Estimate
     from slipid.infer.verdicts.profile import Profile
 
@@ -142,6 +143,8 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     title = f"\nforce balance, {where}: {len(fit.runs)} runs, {fit.rounds} rounds"
     show_estimates(page, fit.parameters.values(), title)
     show_ratios(page, fit.derived.values())
+    if fit.chain is not None:
+        page.line(chain_sentence(fit.chain, fit.parameters.values()))
     for profile in profiles:
         page.line(f"profile: {profile.sentence}")
     if fit.held_out is not None:
@@ -150,6 +153,16 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
         page.line(sensitivity(fit.load_comparisons))
     page.notes(fit.messages)
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
+
+
+def chain_sentence(chain: "Draws", found: "Iterable[Estimate]") -> str:
+    """Return how many parameters have the intervals of a short chain, and how precise they are."""
+    count = sum(e.source == "short_chain" for e in found)
+    least = chain.effective[chain.effective > 0].min()
+    return (
+        f"{count} of these intervals are those of a short chain, which contradicts the Laplace "
+        f"approximation there (at least {least:.0f} effective draws; `slipid sample` has more)"
+    )
 
 
 @dataclass(frozen=True)

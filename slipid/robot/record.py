@@ -21,7 +21,7 @@ Axes = tuple[float, float, float]
 """Values along, across and in yaw."""
 Rows = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 """Rows (ahead, to the left, yaw) of a matrix from the drives' wheel speeds to the body twist."""
-Source = Literal["laplace", "posterior", "given"]
+Source = Literal["laplace", "short_chain", "posterior", "given"]
 Verdict = Literal["identified", "weak", "disputed", "not_identified", "at_bound", "fixed"]
 Provenance = Literal["measured", "borrowed", "override"]
 Basis = Literal["config", "logs", "assumed"]

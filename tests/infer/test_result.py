@@ -24,11 +24,12 @@ from slipid.infer import fit_file
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.fit_file import identified_json, load, save, to_json
 from slipid.infer.posterior import diagnosis
-from slipid.infer.result import Fit
+from slipid.infer.result import Fit, draws
 from slipid.infer.robot_held_out import robot_held_out
 from slipid.infer.slip_curves import by_encoders, has_steady_command, validity
 from slipid.infer.summary import summarise
 from slipid.infer.verdicts.disputed import LoadComparison
+from slipid.infer.verdicts.draws import Draws
 from slipid.infer.verdicts.estimates import estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
 from slipid.lab.selftest.logs import (
@@ -414,6 +415,26 @@ def test_a_saved_fit_comes_back_the_same(tmp_path):
     assert save(back, tmp_path) == names
     assert (tmp_path / "fit.json").read_bytes() == first
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+
+
+def test_draws_that_contradict_the_laplace_approximation_replace_it_also_in_files(tmp_path):
+    """Draws are wider along one parameter only; a quotient with this parameter is wider, too."""
+    fit, path = fit_of(True), "motor.coulomb_friction"
+    at = fit.space.slices[path]
+    z = draws(fit.z, fit.covariance, 64 * 8, 1).reshape(64, 8, -1)
+    z[..., at] = fit.z[at] + 2 * (z[..., at] - fit.z[at])
+    chained = replace(fit, chain=Draws(z))
+    wider, before = chained.parameters[path], fit.parameters[path]
+    assert wider.source == "short_chain"
+    assert wider.value == before.value
+    assert wider.interval90 == pytest.approx(np.quantile(np.exp(z[..., at]), [0.05, 0.95]))
+    assert wider.ratio == pytest.approx(2 * before.ratio, rel=0.15)
+    kept = [p for p, e in chained.parameters.items() if e == fit.parameters[p]]
+    assert len(kept) >= 0.8 * len(fit.parameters)
+    assert chained.derived[f"{path}/motor.back_emf"].source == "short_chain"
+    save(chained, tmp_path)
+    assert load(tmp_path).parameters == chained.parameters
+    assert load(tmp_path).derived == chained.derived
 
 
 def test_a_fit_that_is_older_than_a_parameter_has_its_start_value(tmp_path):

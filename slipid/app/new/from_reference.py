@@ -12,7 +12,7 @@ from slipid.app.reference_robots import (
     reference_robot,
     reference_robots,
 )
-from slipid.infer.verdicts.estimates import Z95
+from slipid.infer.verdicts.draws import Z95
 from slipid.support.errors import DataError
 
 OPTION = "robot"

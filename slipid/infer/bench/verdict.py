@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 
 from slipid.infer.bench.fit import MotorFit
 from slipid.infer.fit_file import SCHEMA, number_json
-from slipid.infer.verdicts.estimates import FROM_ZERO, Z95, Estimate, derived, estimates
+from slipid.infer.verdicts.draws import Z95
+from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members, sentences
 from slipid.infer.verdicts.wording import VOLTAGE
 from slipid.support.content import Content

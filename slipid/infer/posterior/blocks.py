@@ -22,7 +22,7 @@ def require_packages() -> None:
 
     Call it before the modules of this package are imported that need them.
     """
-    for module in ("emcee", "arviz_base", "arviz_stats", "h5netcdf"):
+    for module in ("arviz_base", "arviz_stats", "h5netcdf"):
         require(module, "posterior", "the posterior")
 
 

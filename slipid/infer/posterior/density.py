@@ -17,8 +17,9 @@ by floor.
 
 Electric numbers are drawn for every draw of the motion. Damped Gauss-Newton steps (Levenberg and
 Marquardt) find their most likely values given the motion, and proposals come from a Student t
-around them, whose tails cover those of a skewed density. Each proposal is accepted or rejected by the exact density (Metropolis-Hastings
-with independent proposals; Tierney 1994, Annals of Statistics 22(4)).
+around them, whose tails cover those of a skewed density. Each proposal is accepted or rejected by
+the exact density (Metropolis-Hastings with independent proposals; Tierney 1994, Annals of
+Statistics 22(4)).
 """
 
 from collections.abc import Callable
@@ -311,8 +312,8 @@ def _draw(
 ) -> tuple[Array, Array]:
     """Return the last accepted proposal, and a mask of the accepted proposals.
 
-    `start` is the start of the Levenberg-Marquardt steps, `student` has standard draws of a Student t, and
-    `chance` has logarithms of uniform random numbers.
+    `start` is the start of the Levenberg-Marquardt steps, `student` has standard draws of a Student
+    t, and `chance` has logarithms of uniform random numbers.
     """
 
     def log_prob(x: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.infer.posterior.blocks import LEAST_ROWS, Chain, Learnt, LogDensity, Plan
-from slipid.infer.posterior.proposals import TEMPERATURE, families, wander
+from slipid.infer.posterior.proposals import TEMPERATURE, TRAJECTORIES, families, wander
 from slipid.infer.posterior.surrogate import (
     GroupSurrogate,
     Matrix,
@@ -112,7 +112,7 @@ class Learner:
                 turns = [k for k in range(1, len(of_family)) for _ in range(max(2, calls // 4))]
                 for k in [*turns, *[0] * calls]:
                     key = jax.random.key(random.integers(2**31))
-                    keys = jax.random.split(key, (len(x), 1))
+                    keys = jax.random.split(key, (len(x), TRAJECTORIES))
                     ends = partial(
                         wander,
                         surrogate,

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.fitting.variances import Search, Square
+from slipid.infer.verdicts.draws import Z95, Draws
 from slipid.parameter import Declaration
 from slipid.search_space import Choice, Space
 
@@ -33,8 +34,6 @@ NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Parameters that are not identified without voltages.
 
 Without voltages their scale is determined only by the priors of other parameters."""
-Z95 = 1.6448536269514722
-"""The 95 % quantile of a standard Gaussian."""
 LARGEST_LOG = 600.0
 """Largest logarithm at an end of an interval; exp of a larger one could overflow."""
 
@@ -86,7 +85,8 @@ class Estimate:
             a vector, None for a fixed parameter.
         prior_mean: mean of the prior, None for a fixed parameter [unit].
         prior_std: std of the prior, None for a fixed parameter [unit].
-        source: origin of std and interval: `laplace` approximation or draws of the `posterior`.
+        source: origin of std and interval: `laplace` approximation, draws of a `short_chain` that
+            contradict it, or draws of the `posterior`.
     """
 
     path: str
@@ -112,8 +112,12 @@ def estimates(
     covariance: Square,
     has_voltage: bool,
     flat: Collection[str],
+    chain: Draws | None = None,
 ) -> tuple[Estimate, ...]:
     """Return every declared parameter with its interval and verdict, in order of declaration.
+
+    Std and interval of a parameter are those of the Laplace approximation, or those of the draws of
+    a short chain where both contradict each other.
 
     Args:
         space: free and fixed parameters.
@@ -122,6 +126,7 @@ def estimates(
         covariance: covariance of the search vector.
         has_voltage: True if voltages were logged.
         flat: paths of the parameters that change along flat directions.
+        chain: draws of the short chain.
     """
     tree, slices, out = space.tree(z), space.slices, []
     for e in space.all:
@@ -138,9 +143,23 @@ def estimates(
             forced = "not_identified"
         elif _at_bound(d, value, (mean - prior[0]) / prior[1], prior[1]):
             forced = "at_bound"
-        block, is_flat = covariance[at, at], e.path in flat
-        out.append(judged(base, d, value, mean, block, prior, forced, is_flat))
+        drawn, block, is_flat = None, covariance[at, at], e.path in flat
+        if chain is not None:
+            drawn, block = _contradicting(Draws(chain.z[..., at]), mean, block)
+        found = judged(base, d, value, mean, block, prior, forced, is_flat, drawn)
+        out.append(found if drawn is None else replace(found, source="short_chain"))
     return tuple(out)
+
+
+def _contradicting(
+    draws: Draws,
+    mean: Float[np.ndarray, " coordinate"],
+    block: Float[np.ndarray, "coordinate coordinate"],
+) -> tuple[Float[np.ndarray, "draw coordinate"] | None, Float[np.ndarray, "coordinate coordinate"]]:
+    """Return draws and their covariance if they contradict a Gaussian, else its covariance."""
+    if not draws.contradict(mean, block):
+        return None, block
+    return draws.flat, np.atleast_2d(np.cov(draws.flat.T))
 
 
 def plain(x: Any) -> Any:
@@ -262,13 +281,15 @@ def derived(
     covariance: Square,
     has_voltage: bool,
     draws: Float[np.ndarray, "draw free"] | None = None,
+    chain: Draws | None = None,
 ) -> tuple[Estimate, ...]:
     """Return the quotients `RATIOS` with intervals and verdicts.
 
     The logarithm of a quotient is a difference of two coordinates. The verdict follows from the
     ratio of the posterior std of this difference, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to
     its prior std. If draws of a posterior are given, z and `covariance` must be their mean and
-    covariance; the intervals are then those of the draws.
+    covariance; the intervals are then those of the draws. Draws of a short chain are used as in
+    `estimates`.
     """
     slices = space.slices
     pairs = [
@@ -288,5 +309,9 @@ def derived(
         prior, drawn = (np.atleast_1d(c @ space.prior_mean), prior_std), None
         if draws is not None:
             drawn = (draws @ c)[:, None]
-        out.append(judged(base, d, np.exp(mean), mean, block, prior, forced, False, drawn))
+        elif chain is not None:
+            drawn, block = _contradicting(Draws(chain.z @ c[:, None]), mean, block)
+        found = judged(base, d, np.exp(mean), mean, block, prior, forced, False, drawn)
+        by_chain = chain is not None and drawn is not None
+        out.append(replace(found, source="short_chain") if by_chain else found)
     return tuple(out)

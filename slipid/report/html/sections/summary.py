@@ -268,8 +268,10 @@ def _apart(found: Results) -> TextBlock | None:
 
 def _origin(found: Results) -> str:
     """Return where the intervals come from."""
-    if not any(e["source"] == "posterior" for e in found.parameters.values()):
-        return "Laplace approximation"
+    sources = {e["source"] for e in found.parameters.values()}
+    if "posterior" not in sources:
+        more = ", and of a short chain where it contradicts this" * ("short_chain" in sources)
+        return f"Laplace approximation{more}"
     bad = found.sample is not None and not found.sample["converged"]
     return "posterior, which has NOT converged" if bad else "posterior"
 

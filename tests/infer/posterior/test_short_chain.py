@@ -1,0 +1,42 @@
+"""The short chain gives intervals where the Laplace approximation fails, elsewhere this does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slipid.infer.posterior.coordinates import Fitted
+from slipid.infer.posterior.short_chain import short_chain
+from slipid.infer.result import required
+from slipid.support.progress import Reporter
+from tests.helpers import calibration
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def chained():
+    """Return a fit with a short chain."""
+    fit, _ = calibration.experiment(12)
+    chain = short_chain(required(fit.problem), Fitted.of(fit), 0, Reporter(quiet=True))
+    assert chain is not None
+    return replace(fit, chain=chain)
+
+
+def test_draws_of_numbers_with_small_errors_are_those_of_the_laplace_approximation(chained):
+    chain, std = chained.chain, np.sqrt(np.diag(chained.covariance))
+    sharp = np.flatnonzero(std < 0.02)
+    assert len(sharp) >= 3
+    error = 1 / np.sqrt(2 * chain.effective[sharp])
+    ratio = chain.flat[:, sharp].std(axis=0) / std[sharp]
+    assert (np.abs(ratio - 1) < 4 * error).all()
+    sources = [e.source for e in chained.parameters.values() if e.interval90 is not None]
+    assert {"laplace", "short_chain"} == set(sources)
+
+
+def test_the_chain_is_the_same_for_the_same_seed(chained):
+    problem, fitted = required(chained.problem), Fitted.of(chained)
+    again = short_chain(problem, fitted, 0, Reporter(quiet=True))
+    np.testing.assert_array_equal(again.z, chained.chain.z)
