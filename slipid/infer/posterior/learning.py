@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.infer.posterior.blocks import LEAST_ROWS, Chain, Learnt, LogDensity, Plan
-from slipid.infer.posterior.proposals import TEMPERATURE, TRAJECTORIES, families, wander
+from slipid.infer.posterior.proposals import TEMPERATURE, families, wander
 from slipid.infer.posterior.surrogate import (
     GroupSurrogate,
     Matrix,
@@ -111,8 +111,7 @@ class Learner:
                 # all coordinates last, whose draws spread furthest
                 turns = [k for k in range(1, len(of_family)) for _ in range(max(2, calls // 4))]
                 for k in [*turns, *[0] * calls]:
-                    key = jax.random.key(random.integers(2**31))
-                    keys = jax.random.split(key, (len(x), TRAJECTORIES))
+                    keys = jax.random.split(jax.random.key(random.integers(2**31)), len(x))
                     ends = partial(
                         wander,
                         surrogate,
@@ -120,7 +119,7 @@ class Learner:
                         step=float(step[k]),
                         learning=1.0,
                     )
-                    found = list(pool.map(lambda x, k, ends=ends: ends(x=x, keys=k), x, keys))
+                    found = list(pool.map(lambda x, key, ends=ends: ends(x=x, key=key), x, keys))
                     x = np.stack([np.asarray(f.x) for f in found])
                     drawn.append(x.reshape(-1, target.size))
                     off = np.mean([float(f.followed) for f in found]) - TARGET_FOLLOWED

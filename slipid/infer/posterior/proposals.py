@@ -175,8 +175,8 @@ class Hamiltonian(FamilyMove):
         self.surrogate, self.step = surrogate, step
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> Proposal:
-        keys = jax.random.split(jax.random.key(int(random.randint(2**31))), TRAJECTORIES)
-        found = wander(self.surrogate, x, self.family, self.step, keys)
+        key = jax.random.key(int(random.randint(2**31)))
+        found = wander(self.surrogate, x, self.family, self.step, key)
         factor = np.asarray(found.before - found.after)[:, : self.family.blocks]
         return Proposal(np.asarray(found.x), factor)
 
@@ -218,17 +218,17 @@ def wander(
     x: Float[Array, "walker size"],
     family: Family,
     step: float | Float[Array, ""],
-    keys: Array,
+    key: Array,
     learning: float | Float[Array, ""] = 0.0,
 ) -> Wandered:
-    """Return the ends of Hamiltonian trajectories, one after the other, that start at x.
+    """Return the ends of `TRAJECTORIES` Hamiltonian trajectories that start at x.
 
     Args:
         surrogate: log density, and Gaussian that scales the coordinates.
         x: start of each walker.
         family: coordinates that move, and their blocks.
         step: length of the longest leapfrog step, in standard coordinates.
-        keys: random keys, one for each trajectory.
+        key: random key.
         learning: 1 for a density that is wider by `TEMPERATURE` and bounded by the range of
             plausible rows, from which the next surrogate is learnt; else 0.
     """
@@ -265,7 +265,7 @@ def wander(
 
     u = jnp.linalg.solve(surrogate.root, (x - surrogate.centre).T).T
     first = at(u, jnp.zeros_like(u))
-    last, share = jax.lax.scan(trajectory, first, keys)
+    last, share = jax.lax.scan(trajectory, first, jax.random.split(key, TRAJECTORIES))
     moved = free * (last.u != u).any(axis=1, keepdims=True) > 0
     ends = jnp.where(moved, surrogate.centre + last.u @ surrogate.root.T, x)
     return Wandered(ends, first.value, last.value, jnp.mean(share))

@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 Matrix = Float[np.ndarray, "_ _"]
 Numbers = TypeVar("Numbers", Array, np.ndarray)
 """Array of JAX, or of NumPy, for which JAX compiles nothing."""
-MOST_COMPONENTS = 48
+MOST_COMPONENTS = 64
 """Number of principal components of the residuals of a group; spare ones are zero."""
 LEAST_VARIANCE = 1e-4
 """Variance of a component below which it is left out."""
