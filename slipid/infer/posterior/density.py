@@ -252,8 +252,10 @@ class Density:
 
 _BATCH = 4
 """Number of vectors that are evaluated together."""
-_STEPS, _PROPOSALS = 10, 96
-"""Numbers of Levenberg-Marquardt steps and of proposals for every draw of the motion."""
+_STEPS = 10
+"""Number of Levenberg-Marquardt steps for every draw of the motion."""
+PROPOSALS = 96
+"""Usual number of proposals for every draw of the motion."""
 _FIRST_DAMPING, _DAMPING_RATIO = 1e-3, 10.0
 """Damping of the first step, relative to the information, and its ratio from step to step.
 
@@ -271,6 +273,7 @@ def electric_given_motion(
     covariance: Square,
     x: Float[np.ndarray, "ensemble draw motion"],
     seed: int,
+    proposals: int = PROPOSALS,
 ) -> tuple[Float[np.ndarray, "ensemble draw electric"], Bool[np.ndarray, "each proposal"]]:
     """Return draws of the electric parameters, one for every draw of the motion.
 
@@ -283,6 +286,7 @@ def electric_given_motion(
             regression of electric parameters on those of the motion.
         x: draws of the motion.
         seed: seed of the proposals.
+        proposals: number of proposals for every draw.
     """
     motion, electric = first.structure, second.structure
     slope = np.linalg.solve(
@@ -291,9 +295,9 @@ def electric_given_motion(
     flat = x.reshape(-1, x.shape[-1])
     start = second.centre + (flat - first.centre) @ slope
     rng = np.random.default_rng(seed)
-    student = rng.standard_normal((len(flat), _PROPOSALS + 1, second.size))
+    student = rng.standard_normal((len(flat), proposals + 1, second.size))
     student *= np.sqrt(_DEGREES / rng.chisquare(_DEGREES, student.shape[:2]))[..., None]
-    chance = np.log(rng.uniform(size=(len(flat), _PROPOSALS)))
+    chance = np.log(rng.uniform(size=(len(flat), proposals)))
     many = (first.hold(flat), *map(jnp.asarray, (start, student, chance)))
     drawn, moved = second.mapped(_draw, *many)
     return np.asarray(drawn).reshape(*x.shape[:2], -1), np.asarray(moved)

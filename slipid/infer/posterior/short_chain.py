@@ -17,10 +17,12 @@ from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.infer.verdicts.draws import Draws
 from slipid.support.progress import Reporter
 
-SHORT = Plan(ensembles=2, walkers=32, block=10, warm_up=(1, 2), most=5, rows=800, spread=1.0)
+SHORT = Plan(ensembles=2, walkers=32, block=8, warm_up=(1, 2), most=5, rows=800, spread=1.0)
 """Settings of the sampler: the surrogate is learnt twice, and three blocks are kept."""
-THINNED = 3
+THINNED = 4
 """One of so many steps is kept."""
+PROPOSALS = 32
+"""Number of proposals for the electric parameters of every draw."""
 
 
 def short_chain(problem: Problem, fitted: Fitted, seed: int, report: Reporter) -> Draws | None:
@@ -43,7 +45,7 @@ def short_chain(problem: Problem, fitted: Fitted, seed: int, report: Reporter) -
     if not problem.objective.joint:
         second = Density(problem, fitted, ELECTRIC)
         if second.size:
-            drawn, _ = electric_given_motion(first, second, fitted.covariance, x, seed)
+            drawn, _ = electric_given_motion(first, second, fitted.covariance, x, seed, PROPOSALS)
             z[..., second.structure] = drawn
     found = Draws(z)
     if found.useful:
