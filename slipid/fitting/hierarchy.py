@@ -76,22 +76,6 @@ def effect_variances(axes: Iterable[AxisEffects], log_v: Variances) -> Variances
     return out
 
 
-def effect_information(
-    axes: Iterable[AxisEffects], log_v: Variances
-) -> Float[np.ndarray, "variance variance"]:
-    """Return the expected information of the log variances that `effect_variances` estimates.
-
-    Rows and columns of all other variances are zero.
-    """
-    out = np.zeros((len(log_v), len(log_v)))
-    for axis in axes:
-        v = np.exp(log_v)[axis.numbers]
-        inverse = np.linalg.inv(_covariance(axis, v))
-        grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
-        out[np.ix_(axis.numbers, axis.numbers)] += _information(grown)
-    return out
-
-
 def extrapolation(
     axes: Iterable[AxisEffects],
     log_v: Variances,

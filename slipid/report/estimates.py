@@ -156,12 +156,12 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
 
 
 def chain_sentence(chain: "Draws", found: "Iterable[Estimate]") -> str:
-    """Return how many parameters have the intervals of a short chain, and how precise they are."""
-    count = sum(e.source == "short_chain" for e in found)
+    """Return which parameters have the intervals of a short chain, and how precise they are."""
+    named = [e.path for e in found if e.source == "short_chain"]
     least = chain.effective[chain.effective > 0].min()
     return (
-        f"{count} of these intervals are those of a short chain, which contradicts the Laplace "
-        f"approximation there (at least {least:.0f} effective draws; `slipid sample` has more)"
+        f"intervals of a short chain (at least {least:.0f} effective draws), which contradicts the "
+        f"Laplace approximation: {counted(named) if named else 'none'}"
     )
 
 

@@ -21,6 +21,8 @@ from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import calibration
 
 REPLICATES = quick(200, 2)
+VARIANCES, KEPT_BACK = quick(60, 2), 1000
+"""Number of experiments of which only the variances are drawn, and the seed of the first."""
 BINS = 10
 
 
@@ -44,6 +46,15 @@ def test_coverage_and_ranks():
     covered, even = report(rows, folder)
     assert QUICK or covered.all()
     assert QUICK or even.all()
+
+
+def test_coverage_of_variances():
+    """Intervals of variances, whose draws do not need those of the numbers."""
+    seeds = range(KEPT_BACK, KEPT_BACK + VARIANCES)
+    rank = np.array([calibration.variance_ranks(seed) for seed in seeds])
+    report_kinds(calibration.problem().noise.names, rank)
+    inside = (rank >= 0.05) & (rank <= 0.95)
+    assert QUICK or inside.mean() > 0.85
 
 
 def replicate(seed):
@@ -70,10 +81,30 @@ def report(rows, folder):
             + " ".join(f"{n:3d}" for n in bins[k])
         )
     print(f"all together: coverage {inside.mean():.4f}")
+    variances = [k for k, name in enumerate(names) if name.startswith("noise.")]
+    report_kinds([names[k].removeprefix("noise.") for k in variances], rank[:, variances])
     if folder.is_dir():
         draw(names, bins, count, folder / "ranks.png")
     share = inside.mean(axis=0)
     return (low <= share) & (share <= high), uneven < most
+
+
+def report_kinds(names, rank):
+    """Print the coverage of each kind of variance, its Monte Carlo error, and the ranks."""
+    kinds = {}
+    for k, name in enumerate(names):
+        kind, *_, what = name.split(".")
+        of_axis = kind in ("process", "run", "neighbours", "session")
+        kinds.setdefault(kind if of_axis else f"{kind}.{what}", []).append(k)
+    kinds["all"] = list(range(len(names)))
+    print(f"\n{len(rank)} experiments, coverage of 90 % intervals with its Monte Carlo error")
+    for kind, mine in kinds.items():
+        of = rank[:, mine]
+        share = ((of >= 0.05) & (of <= 0.95)).mean(axis=1)
+        print(
+            f"{kind:20}{len(mine):4d}{share.mean():8.3f} +- {share.std() / np.sqrt(len(of)):.3f}  "
+            + " ".join(f"{n:3d}" for n in np.histogram(of, BINS, (0, 1))[0])
+        )
 
 
 def draw(names, bins, count, path):

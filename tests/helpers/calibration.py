@@ -21,6 +21,8 @@ from slipid.fitting.problem import Problem
 from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD
 from slipid.infer.posterior import sample as posterior
 from slipid.infer.posterior.blocks import Plan
+from slipid.infer.posterior.coordinates import Fitted
+from slipid.infer.posterior.variance_draws import drawn_variances
 from slipid.infer.result import Channels, Fit
 from slipid.predict.open_loop import chain
 from slipid.search_space import Choice
@@ -140,6 +142,14 @@ def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
         ratio=draws.std(axis=(0, 1)) / prior_std,
         r_hat=float(found.diagnosis.r_hat.max()),
     )
+
+
+def variance_ranks(seed: int, draws: int = 400) -> np.ndarray:
+    """Return the part of the draws of every variance below its truth, in one made experiment."""
+    fit, truth = experiment(seed)
+    fitted = Fitted.of(fit)
+    drawn = drawn_variances(fit.problem, fitted, (PLAN.ensembles, draws), seed)
+    return (drawn < truth[fit.space.size :]).mean(axis=(0, 1))
 
 
 def filled(common: Problem, z: np.ndarray, log_v: np.ndarray, rng: np.random.Generator):

@@ -20,15 +20,15 @@ from jaxtyping import Float
 from xarray import DataTree
 
 from slipid.fitting import likelihood as lk
-from slipid.fitting.hierarchy import axis_effects, effect_information, pooled_stds
-from slipid.fitting.problem import Problem, linear
-from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD, information
+from slipid.fitting.problem import Problem
+from slipid.fitting.variances import DEGREES
 from slipid.infer.posterior import diagnosis, ensemble
 from slipid.infer.posterior.blocks import Chain, ChainBlock, Plan
-from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, effects_at
+from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.posterior.left_out import log_likelihoods
+from slipid.infer.posterior.variance_draws import drawn_variances
 from slipid.infer.result import Fit, required
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
@@ -58,6 +58,8 @@ def sampled(
     found = diagnosis.diagnose(chain, plan)
     x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)
     shape = (plan.ensembles, draws)
+    report.stage("drawing the variances of the noise", usual_s=COMPILING_S)
+    log_variance = drawn_variances(problem, fitted, shape, plan.seed)
     out = np.broadcast_to(fitted.z, (*shape, len(fitted.z))).copy()
     out[..., first.structure] = x
     accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}
@@ -80,7 +82,7 @@ def sampled(
     return Posterior(
         fit=fit,
         z=out,
-        log_variance=drawn_variances(problem, fitted, shape, plan.seed),
+        log_variance=log_variance,
         log_prob=log_prob,
         names=first.names,
         diagnosis=found,
@@ -102,36 +104,6 @@ def thinned(
     step = ((np.arange(draws) + 0.5) / draws * steps).astype(int)
     walker = np.arange(draws) * 7 % walkers if walkers % 7 else np.arange(draws) % walkers
     return chain[:, step, walker], log_prob[:, step, walker]
-
-
-def drawn_variances(
-    problem: Problem, fitted: Fitted, shape: tuple[int, int], seed: int
-) -> Float[np.ndarray, "ensemble draw variance"]:
-    """Return draws of the log variances, which stay fixed in the chains.
-
-    The log variances depend little on the parameters of the model. They are drawn from a Gaussian
-    around the fit with their expected information. Only the variance of the load biases is drawn
-    on a grid: its posterior is not Gaussian, since there are few biases.
-    """
-    log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
-    electric = problem.electric(fitted.z, log_v)
-    residual, jacobian, motor_force, _ = linear(problem.objective, fitted.z, electric)
-    through = problem.voltage_information(fitted.z, log_v, motor_force)
-    effect = effects_at(problem, residual, log_v)
-    weight = problem.weighed(residual, log_v, keep, effect).whitening.weight["motion"]
-    motion = residual["motion"], jacobian["motion"]
-    precision = np.array(information(problem.noise.blocks, log_v, keep, through))
-    of_blocks = np.asarray(problem.objective.scored)
-    precision *= of_blocks[:, None] & of_blocks
-    axes = axis_effects(problem.objective, motion, weight, fitted.covariance, log_v)
-    precision += effect_information(axes, log_v)
-    precision[np.diag_indices_from(precision)] += np.where(of_blocks, 0.0, 1 / VARIANCE_SPREAD**2)
-    root = np.linalg.cholesky(np.linalg.inv(precision))
-    rng = np.random.default_rng([seed, 1])
-    out = log_v + rng.standard_normal((*shape, len(log_v))) @ root.T
-    pooled = pooled_stds(np.linalg.inv(fitted.covariance), fitted.z, problem.objective, log_v)
-    out[..., problem.objective.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
-    return np.asarray(out)
 
 
 SCHEMA = "slipid.posterior/1"

@@ -92,10 +92,12 @@ def test_electric_draws_with_few_accepted_proposals_prevent_convergence(whole, m
 
 @pytest.fixture(scope="module")
 def whole():
-    """Return an experiment, with blocks and draws of its posterior."""
+    """Yield an experiment, with blocks and draws of its posterior; few sweeps draw variances."""
     fit, _ = calibration.experiment(12)
     plan = Plan(ensembles=2, walkers=6, block=5, warm_up=(1, 2), most=4, rows=200)
     blocks = Memory()
-    found = posterior.sampled(fit, plan, 10, blocks, QUIET)
-    assert [part for part, _ in blocks.blocks] == [MOTION] * 4
-    return fit, plan, blocks, found
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("slipid.infer.posterior.variance_draws._SWEEPS", (10, 10))
+        found = posterior.sampled(fit, plan, 10, blocks, QUIET)
+        assert [part for part, _ in blocks.blocks] == [MOTION] * 4
+        yield fit, plan, blocks, found

@@ -9,12 +9,11 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from slipid.fitting.hierarchy import axis_effects, effect_information
-from slipid.fitting.noise import POOLED
 from slipid.fitting.problem import Problem
 from slipid.infer.posterior.blocks import ChainBlock
-from slipid.infer.posterior.coordinates import Fitted, effects_at
-from slipid.infer.posterior.sample import drawn_variances, thinned
+from slipid.infer.posterior.coordinates import Fitted
+from slipid.infer.posterior.sample import thinned
+from slipid.infer.posterior.variance_draws import drawn_variances
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -38,72 +37,10 @@ def fitted(problem):
     return Fitted(z, log_v, problem.laplace(z, log_v, np.ones(len(problem.windows))))
 
 
-def by_definition(problem, log_v):
-    """Return the information of log variances, 1/2 tr(V^-1 dV V^-1 dV), and of their prior."""
-    precision, h = np.eye(len(log_v)) / 9, 1e-4
-    for k in ("motion", "current"):
-        inverse = np.linalg.inv(np.asarray(problem.covariance(k, log_v)))
-        grown = [
-            inverse
-            @ np.asarray(
-                problem.covariance(k, log_v + h * e) - problem.covariance(k, log_v - h * e)
-            )
-            / (2 * h)
-            for e in np.eye(len(log_v))
-        ]
-        precision += 0.5 * np.array([[np.einsum("nij,nji", a, b) for b in grown] for a in grown])
-    return precision
-
-
 @pytest.mark.slow
-def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
-    """Information of segments is that of the definition, that of effects the one of the fit."""
-    end = fitted(problem)
-    log_v, names = end.log_variance, problem.noise.names
-    draws = drawn_variances(problem, end, SHAPE, 0).reshape(-1, len(names))
-    single = np.array([n.startswith(("camera", "process", "current")) for n in names])
-    residual, jacobian = problem.linear(end.z, problem.electric(end.z, log_v))
-    effect = effects_at(problem, residual, log_v)
-    weight = problem.weighed(residual, log_v, np.ones(24), effect).whitening.weight["motion"]
-    motion = residual["motion"], jacobian["motion"]
-    axes = axis_effects(problem.objective, motion, weight, end.covariance, log_v)
-    of_effects = effect_information(axes, log_v)
-    of_effects += np.eye(len(log_v)) / 9
-    precision = np.where(single[:, None] & single, by_definition(problem, log_v), 0.0)
-    precision += np.where(~single[:, None] & ~single, of_effects, 0.0)
-    drawn = np.array([n != POOLED for n in names])
-    expected = np.linalg.inv(precision)[np.ix_(drawn, drawn)]
-    std, count = np.sqrt(np.diag(expected)), len(draws)
-    away = (draws.mean(axis=0) - log_v)[drawn] / std
-    np.testing.assert_allclose(away, 0.0, atol=4 / np.sqrt(count))
-    found = np.cov(draws[:, drawn].T) / std / std[:, None]
-    np.testing.assert_allclose(found, expected / std / std[:, None], atol=6 / np.sqrt(count))
-    # data determine some of them well, others hardly beside the prior's 3
-    assert std.min() < 0.3
-    assert std.max() > 2
-
-
-@pytest.mark.slow
-def test_runs_with_a_common_error_are_no_outliers_to_variances(problem, monkeypatch):
-    """A wrong creep changes neighbouring runs in the same way, like a shared effect."""
-    weights = []
-
-    def spied(target, motion, weight, *rest):
-        weights.append(np.asarray(weight))
-        return axis_effects(target, motion, weight, *rest)
-
-    monkeypatch.setattr("slipid.infer.posterior.sample.axis_effects", spied)
-    z, log_v = problem.space.start + 0.3, 2 * np.log(problem.noise.typical)
-    every = np.ones(len(problem.windows))
-    drawn_variances(problem, Fitted(z, log_v, problem.laplace(z, log_v, every)), (1, 2), 0)
-    residual, _ = problem.linear(z, problem.electric(z, log_v))
-    whole = np.asarray(problem.whitening(residual, log_v, every).weight["motion"])
-    assert weights[0].mean() > whole.mean() + 0.03
-
-
-@pytest.mark.slow
-def test_the_std_of_load_biases_is_drawn_from_its_likelihood(problem):
+def test_the_std_of_load_biases_is_drawn_from_its_likelihood(problem, monkeypatch):
     """Load biases with known likelihoods have a half-normal prior of their common std."""
+    monkeypatch.setattr("slipid.infer.posterior.variance_draws._SWEEPS", (10, 10))
     end, at = fitted(problem), problem.space.pooled
     now, typical = np.exp(0.5 * end.log_variance[problem.objective.pooled]), 0.05
     sure = 0.02**-2  # precision of the data alone
