@@ -1,7 +1,8 @@
 """Function `fit`: fit a robot to runs, with priors and choices given as arguments."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -42,6 +43,7 @@ def fit(
     free: Sequence[str] = (),
     image_centre: tuple[float, float] = (0.0, 0.0),
     windows_per_piece: int = 4,
+    intervals: Literal["sampled", "laplace"] = "sampled",
     seed: int = 0,
     quiet: bool = False,
 ) -> Fit:
@@ -63,7 +65,10 @@ def fit(
             cause no error [m].
         windows_per_piece: number of neighbouring windows in a segment, which the fit treats as one
             observation.
-        seed: seed of the draws from which the bands of slip curves are computed.
+        intervals: "sampled" if a short chain of the posterior replaces intervals of the Laplace
+            approximation that it contradicts; "laplace" for the approximation alone, which takes
+            less time.
+        seed: seed of that chain and of the draws from which the bands of slip curves are computed.
         quiet: True to report no progress.
 
     Raises:
@@ -75,6 +80,7 @@ def fit(
     refuse_misordered(runs.logs)
     chosen = priors or {}, fixed or {}, start or {}, free
     task = fit_task_of(runs, robot, *chosen, image_centre, windows_per_piece, seed)
+    task = replace(task, settings=task.settings.model_copy(update={"intervals": intervals}))
     with Reporter(quiet=quiet) as report:
         return fitted(task, report)[0]
 

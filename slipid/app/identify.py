@@ -12,7 +12,7 @@ import numpy as np
 
 from slipid.app.calibrate import calibrated, remarks, write_run
 from slipid.app.check import sanity
-from slipid.app.config import read_config
+from slipid.app.config import FitSection, read_config
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.data.check.findings import wrong
 from slipid.fitting.multi_floor import multi_floor_runs
@@ -22,7 +22,7 @@ from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
 from slipid.infer.posterior.coordinates import Fitted
 from slipid.infer.posterior.short_chain import short_chain
-from slipid.infer.result import Fit
+from slipid.infer.result import Fit, required
 from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
 from slipid.infer.verdicts.trust import Trust
@@ -292,8 +292,7 @@ def summarised(
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
         fit = _with_mixed_runs(fit, task, problem, optimum, report)
-    elif fit.converged and task.settings.intervals == "sampled":
-        fit = replace(fit, chain=short_chain(problem, Fitted.of(fit), task.settings.seed, report))
+    fit = with_chain(fit, task.settings, report)
     report.stage("predicting held-out runs")
     contact = contact_errors(task.dataset, problem, optimum, report.steps)
     selection = selected(
@@ -308,6 +307,17 @@ def summarised(
     )
     report.stage("simpler models, for comparison")
     return _with_baselines(fit, task)
+
+
+def with_chain(fit: Fit, settings: FitSection, report: Reporter) -> Fit:
+    """Return the fit with the draws of a short chain, if the settings ask for them.
+
+    A fit that learnt from runs over several floors, or did not converge, stays as it is.
+    """
+    if settings.intervals != "sampled" or fit.mixed is not None or not fit.converged:
+        return fit
+    chain = short_chain(required(fit.problem), Fitted.of(fit), settings.seed, report)
+    return replace(fit, chain=chain)
 
 
 def _with_mixed_runs(

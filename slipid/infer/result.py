@@ -312,7 +312,7 @@ class Fit:
         return proposal.design(Scope(self, parameters=parameters, runs=runs))
 
     def deploy(self) -> "DeployedRobot":
-        """Return the model for the robot, with the intervals of the Laplace covariance.
+        """Return the model for the robot, with the intervals of the fit.
 
         Raises:
             ValueError: the wheels' kinematics have rank below 3.

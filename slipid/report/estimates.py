@@ -144,7 +144,8 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     show_estimates(page, fit.parameters.values(), title)
     show_ratios(page, fit.derived.values())
     if fit.chain is not None:
-        page.line(chain_sentence(fit.chain, fit.parameters.values()))
+        every = *fit.parameters.values(), *fit.derived.values()
+        page.line(chain_sentence(fit.chain, every))
     for profile in profiles:
         page.line(f"profile: {profile.sentence}")
     if fit.held_out is not None:
@@ -158,10 +159,11 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
 def chain_sentence(chain: "Draws", found: "Iterable[Estimate]") -> str:
     """Return which parameters have the intervals of a short chain, and how precise they are."""
     named = [e.path for e in found if e.source == "short_chain"]
-    least = chain.effective[chain.effective > 0].min()
+    draws = f"a short chain (at least {chain.effective.min():.0f} effective draws)"
+    if not named:
+        return f"{draws} contradicts no interval of the Laplace approximation"
     return (
-        f"intervals of a short chain (at least {least:.0f} effective draws), which contradicts the "
-        f"Laplace approximation: {counted(named) if named else 'none'}"
+        f"intervals of {draws}, which contradicts the Laplace approximation, for {counted(named)}"
     )
 
 

@@ -21,7 +21,7 @@ from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import calibration
 
 REPLICATES = quick(200, 2)
-VARIANCES, KEPT_BACK = quick(60, 2), 1000
+VARIANCES, HELD_OUT = quick(60, 2), 1000
 """Number of experiments of which only the variances are drawn, and the seed of the first."""
 BINS = 10
 
@@ -50,7 +50,7 @@ def test_coverage_and_ranks():
 
 def test_coverage_of_variances():
     """Intervals of variances, whose draws do not need those of the numbers."""
-    seeds = range(KEPT_BACK, KEPT_BACK + VARIANCES)
+    seeds = range(HELD_OUT, HELD_OUT + VARIANCES)
     rank = np.array([calibration.variance_ranks(seed) for seed in seeds])
     report_kinds(calibration.problem().noise.names, rank)
     inside = (rank >= 0.05) & (rank <= 0.95)

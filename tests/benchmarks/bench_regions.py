@@ -47,6 +47,7 @@ def spreads(fit_folder):
         )
         for z in fit.draws(DRAWS)
     ]
+    print(f"draws of {'the Laplace approximation' if fit.chain is None else 'a short chain'}")
     floor, drawn, linear = [], [], []
     for w in replay_windows(task.dataset, fit.contact.robot):
         _, slope = fit.contact.tracks_and_slopes(w)

@@ -10,6 +10,11 @@ import pytest
 from tests.benchmarks.quick import QUICK, thinned
 
 
+@pytest.fixture(scope="session", autouse=True)
+def laplace_intervals() -> None:
+    """Fits of benchmarks have their short chain, unlike those of tests."""
+
+
 @pytest.fixture(scope="session")
 def real_data(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the real logs; in the quick form one with few of them."""

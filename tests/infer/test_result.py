@@ -43,6 +43,7 @@ from slipid.predict.validation import validation
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, hash_of
+from slipid.support.progress import Reporter
 
 pytestmark = pytest.mark.slow  # traces whole fits
 
@@ -432,9 +433,32 @@ def test_draws_that_contradict_the_laplace_approximation_replace_it_also_in_file
     kept = [p for p, e in chained.parameters.items() if e == fit.parameters[p]]
     assert len(kept) >= 0.8 * len(fit.parameters)
     assert chained.derived[f"{path}/motor.back_emf"].source == "short_chain"
+    assert "intervals of a short chain (at least" in str(chained)
+    assert path in str(chained).partition("Laplace approximation, for")[2]
+    record = chained.deploy().record
+    assert record.source == "short_chain"
+    assert record.parameters[path].source == "short_chain"
     save(chained, tmp_path)
     assert load(tmp_path).parameters == chained.parameters
     assert load(tmp_path).derived == chained.derived
+
+
+def test_a_fit_that_converged_and_knows_one_floor_per_run_has_a_chain_if_it_is_wanted(monkeypatch):
+    from slipid.app import identify
+    from slipid.app.config import FitSection
+
+    found = Draws(np.zeros((2, 2, fit_of(True).space.size)))
+    monkeypatch.setattr(identify, "short_chain", lambda *_: found)
+    fit, quiet = replace(fit_of(True), converged=True), Reporter(quiet=True)
+
+    def chain(fit: Fit, intervals: str) -> Draws | None:
+        return identify.with_chain(fit, FitSection(intervals=intervals), quiet).chain
+
+    assert chain(fit, "sampled") is found
+    assert chain(fit, "laplace") is None
+    assert chain(replace(fit, converged=False), "sampled") is None
+    assert chain(replace(fit, mixed={"runs": 3}), "sampled") is None
+    assert chain(replace(fit, refused={"reason": "they contradict"}), "sampled") is found
 
 
 def test_a_fit_that_is_older_than_a_parameter_has_its_start_value(tmp_path):

@@ -261,6 +261,11 @@ _FIRST_DAMPING, _DAMPING_RATIO = 1e-3, 10.0
 
 Undamped, steps along the logarithm of a small parameter overshoot, and proposals around their end
 miss most of the density."""
+LEAST_ACCEPTED, MOST_REFUSED = 0.05, 0.1
+"""Smallest accepted fraction of the proposals for the electric parameters of one draw, and largest
+tolerated fraction of draws that accept fewer.
+
+Where few are accepted, proposals miss a part of the density, however many are made."""
 _DEGREES = 5.0
 """Degrees of freedom of the Student t from which electric parameters are proposed."""
 _SCALE_RATIO = 1.15
@@ -301,6 +306,11 @@ def electric_given_motion(
     many = (first.hold(flat), *map(jnp.asarray, (start, student, chance)))
     drawn, moved = second.mapped(_draw, *many)
     return np.asarray(drawn).reshape(*x.shape[:2], -1), np.asarray(moved)
+
+
+def refused(moved: Bool[np.ndarray, "each proposal"]) -> float:
+    """Return the fraction of draws that accepted less than `LEAST_ACCEPTED` of their proposals."""
+    return float((moved.mean(axis=1) < LEAST_ACCEPTED).mean())
 
 
 class _Climb(NamedTuple):

@@ -85,8 +85,8 @@ class Posterior:
         names: names of the coordinates that were sampled by chains.
         diagnosis: convergence of the chains.
         accepted: fraction of accepted moves, keyed by part of the posterior.
-        converged: True if the chains converged and nearly all electric draws had an accepted
-            proposal.
+        converged: True if the chains converged and few electric draws refused nearly all
+            proposals.
         reason: value of the criterion that is furthest from being met, as a string.
     """
 

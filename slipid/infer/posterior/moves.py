@@ -4,6 +4,7 @@ Sources: Neal 2003, Annals of Statistics 31(3), slice sampling; Neal 2011, Handb
 Monte Carlo, chapter 5, Hamiltonian Monte Carlo.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,8 +18,14 @@ Chains = Float[np.ndarray, "chain coordinate"]
 def sliced(
     log_density: Callable[[float], float], x: float, width: float, rng: np.random.Generator
 ) -> float:
-    """Return the next state of a univariate slice sampler; `width` is that of a step outwards."""
+    """Return the next state of a univariate slice sampler; `width` is that of a step outwards.
+
+    Raises:
+        ValueError: the density at x is not finite.
+    """
     level = log_density(x) - rng.exponential()
+    if not math.isfinite(level):
+        raise ValueError(f"log density {level} at {x}; expected a finite one")
     low = x - width * rng.uniform()
     high = low + width
     while log_density(low) > level:
@@ -32,7 +39,7 @@ def sliced(
         low, high = (new, high) if new < x else (low, new)
 
 
-class Target(NamedTuple):
+class SlopedDensity(NamedTuple):
     """A density, as functions of the positions of all chains.
 
     Attributes:
@@ -57,7 +64,7 @@ class Moved(NamedTuple):
 
 
 def hamiltonian(
-    target: Target,
+    target: SlopedDensity,
     x: Chains,
     root: Float[np.ndarray, "coordinate coordinate"],
     step: float,

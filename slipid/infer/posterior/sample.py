@@ -25,7 +25,13 @@ from slipid.fitting.variances import DEGREES
 from slipid.infer.posterior import diagnosis, ensemble
 from slipid.infer.posterior.blocks import Chain, ChainBlock, Plan
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
-from slipid.infer.posterior.density import Density, electric_given_motion
+from slipid.infer.posterior.density import (
+    LEAST_ACCEPTED,
+    MOST_REFUSED,
+    Density,
+    electric_given_motion,
+    refused,
+)
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.posterior.left_out import log_likelihoods
 from slipid.infer.posterior.variance_draws import drawn_variances
@@ -34,12 +40,6 @@ from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.files import write_bytes
 from slipid.support.progress import COMPILING_S, Reporter
-
-LEAST_ACCEPTED, MOST_REFUSED = 0.05, 0.1
-"""Smallest accepted fraction of the proposals for the electric parameters of one draw, and largest
-tolerated fraction of draws that accept fewer.
-
-Where few are accepted, proposals miss a part of the density, however many are made."""
 
 
 def sampled(
@@ -63,7 +63,7 @@ def sampled(
     out = np.broadcast_to(fitted.z, (*shape, len(fitted.z))).copy()
     out[..., first.structure] = x
     accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}
-    refused, reason = 0.0, f"{found.reason} ({first.names[found.worst]})"
+    few, reason = 0.0, f"{found.reason} ({first.names[found.worst]})"
     if len(parts) > 1:
         second = Density(problem, fitted, ELECTRIC)
         if second.size:
@@ -71,12 +71,12 @@ def sampled(
             drawn, moved = electric_given_motion(first, second, fitted.covariance, x, plan.seed)
             out[..., second.structure] = drawn
             accepted[ELECTRIC] = float(moved.mean())
-            refused = float((moved.mean(axis=1) < LEAST_ACCEPTED).mean())
+            few = refused(moved)
     if not np.isfinite(out).all():
-        refused, reason = 1.0, "electric draws that are not finite"
-    elif found.converged and refused > MOST_REFUSED:
+        few, reason = 1.0, "electric draws that are not finite"
+    elif found.converged and few > MOST_REFUSED:
         reason = (
-            f"{100 * refused:.1f} % of the electric draws, which accepted less than "
+            f"{100 * few:.1f} % of the electric draws, which accepted less than "
             f"{100 * LEAST_ACCEPTED:.0f} % of their proposals"
         )
     return Posterior(
@@ -87,7 +87,7 @@ def sampled(
         names=first.names,
         diagnosis=found,
         accepted=accepted,
-        converged=found.converged and refused <= MOST_REFUSED,
+        converged=found.converged and few <= MOST_REFUSED,
         reason=reason,
     )
 

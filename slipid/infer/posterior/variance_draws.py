@@ -36,9 +36,8 @@ from slipid.fitting.hierarchy import pooled_stds
 from slipid.fitting.problem import Problem
 from slipid.fitting.variances import VARIANCE_SPREAD, Search, Variances, information
 from slipid.infer.posterior.coordinates import Fitted
-from slipid.infer.posterior.moves import hamiltonian, sliced
+from slipid.infer.posterior.moves import Chains, hamiltonian, sliced
 from slipid.infer.posterior.variance_likelihood import (
-    Chains,
     LinearPart,
     Residuals,
     Rows,
@@ -260,8 +259,8 @@ def floor_information(
     for i, j in zip(*np.tril_indices(axes), strict=True):
         inner[at[i], at[j]] += basis[i].T @ (of_effects[:, i, j, None] * basis[j])
     factor = np.linalg.cholesky(inner)
-    seen = np.concatenate([a.T @ pull[:, i] for i, a in enumerate(basis)])
-    half = solve_triangular(factor, seen, lower=True, check_finite=False)
+    of_coefs = np.concatenate([a.T @ pull[:, i] for i, a in enumerate(basis)])
+    half = solve_triangular(factor, of_coefs, lower=True, check_finite=False)
     return FloorInformation(of_effects, pull, factor, half, product - half.T @ half)
 
 
@@ -300,15 +299,15 @@ def _linear_draw(
         whole = np.append(change[floor.columns], 1.0)
         mean = info.half @ whole + rng.standard_normal(len(info.half))
         coefs = solve_triangular(info.factor, mean, lower=True, trans=1, check_finite=False)
-        seen = info.of_effects, info.pull @ whole
-        effects.append(_effect_draws(part, floor, seen, coefs, log_v, rng))
+        known = info.of_effects, info.pull @ whole
+        effects.append(_effect_draws(part, floor, known, coefs, log_v, rng))
     return LinearDraw(log_v, first + change, effects)
 
 
 def _effect_draws(
     part: LinearPart,
     floor: FloorRuns,
-    seen: tuple[np.ndarray, np.ndarray],
+    known: tuple[np.ndarray, np.ndarray],
     coefs: Float[np.ndarray, " coef"],
     log_v: Variances,
     rng: np.random.Generator,
@@ -316,11 +315,11 @@ def _effect_draws(
     """Return the effects of all runs, and draw their variances in place.
 
     Args:
-        seen: information about every run's effects, and information times estimate.
+        known: information about every run's effects, and information times estimate.
         coefs: coefficients of the effects.
         log_v: all log variances; those of the floor's shared effects are overwritten.
     """
-    information, pull = seen
+    information, pull = known
     split = np.cumsum([r.shape[1] for r in floor.roots])[:-1]
     if not floor.roots:
         return np.zeros_like(pull)
@@ -331,7 +330,10 @@ def _effect_draws(
         effects[:, k // 2] += std * unit
     for k, (n, unit) in enumerate(zip(floor.numbers, units, strict=True)):
         size = floor.roots[k].shape[1]
-        if n < 0 or not size:
+        if n < 0:
+            continue
+        if not size:  # residuals do not depend on it
+            log_v[n] = rng.normal(float(part.typical[n]), VARIANCE_SPREAD)
             continue
         axis, before, typical = k // 2, float(log_v[n]), float(part.typical[n])
         std = np.exp(0.5 * before)
@@ -387,8 +389,8 @@ class Gaussian(NamedTuple):
         x = np.concatenate(states)
         share = len(x) / (len(x) + _PSEUDO)
         mean = share * x.mean(axis=0) + (1 - share) * self.mean
-        gap = x - mean
-        return Gaussian(mean, share * gap.T @ gap / len(x) + (1 - share) * self.covariance)
+        off = x - mean
+        return Gaussian(mean, share * off.T @ off / len(x) + (1 - share) * self.covariance)
 
     def root(self, moved: Bool[np.ndarray, " variance"]) -> np.ndarray:
         """Return a root of the covariance; variances that are not moved have zeros."""

@@ -29,12 +29,11 @@ from slipid.fitting.variances import (
     Variances,
 )
 from slipid.infer.posterior.coordinates import Fitted
-from slipid.infer.posterior.moves import Target
+from slipid.infer.posterior.moves import Chains, SlopedDensity
 
 _RANGE = (-50.0, 10.0)
 """Range of log variances; beyond it, where leapfrog steps may end, residuals do not change."""
 
-Chains = Float[np.ndarray, "chain variance"]
 """Log variances of every chain."""
 Rows = dict[str, Float[np.ndarray, "segment m column"]]
 """Derivatives of residuals with respect to the search vector, then the residuals, by block."""
@@ -277,7 +276,7 @@ def _of_voltages(
     return jax.value_and_grad(log_likelihood)(log_v)
 
 
-def target(part: LinearPart, noises: dict[str, SegmentNoise], at: Residuals) -> Target:
+def target(part: LinearPart, noises: dict[str, SegmentNoise], at: Residuals) -> SlopedDensity:
     """Return the density of the log variances given residuals, with the weights integrated out."""
 
     def of_voltages(log_v: Chains) -> Iterator[tuple[Array, Array]]:
@@ -298,7 +297,7 @@ def target(part: LinearPart, noises: dict[str, SegmentNoise], at: Residuals) -> 
         out += sum(n.slope(at.blocks[k], log_v) for k, n in noises.items() if k != "voltage")
         return out + np.array([np.asarray(by) for _, by in of_voltages(log_v)] or 0.0)
 
-    return Target(log_density, slope)
+    return SlopedDensity(log_density, slope)
 
 
 def divided(part: LinearPart, at: Residuals, log_v: Chains) -> dict[str, np.ndarray]:

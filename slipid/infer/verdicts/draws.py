@@ -7,11 +7,13 @@ from jaxtyping import Float
 
 Z95 = 1.6448536269514722
 """The 95 % quantile of a standard Gaussian."""
-LEAST_EFFECTIVE = 50.0
-"""Smallest number of effective draws of every number for which draws are of use."""
+LEAST_EFFECTIVE = 1.25
+"""Smallest number of effective draws per walker for which draws are of use.
+
+Walkers that stay where they start have one."""
 QUANTILE_ERROR = 2.11
 """Standard error of a Gaussian's 5 % quantile from n independent draws, times sqrt(n) [std]."""
-CONTRADICTION = 2.0
+CONTRADICTION = 2.5
 """Difference between an end of the interval of the draws and of the Gaussian approximation above
 which they contradict each other [standard error]."""
 
@@ -30,7 +32,7 @@ class Draws(NamedTuple):
     def effective(self) -> Float[np.ndarray, " size"]:
         """Number of independent draws whose mean has the same variance, at most that of all draws.
 
-        It follows from the scatter of the means of independent walkers.
+        It follows from the scatter of the walkers' means, as if walkers were independent.
         """
         of_means = self.z.mean(axis=1).var(axis=0, ddof=1)
         ratio = self.flat.var(axis=0) / np.maximum(of_means, np.finfo(float).tiny)
@@ -39,18 +41,25 @@ class Draws(NamedTuple):
     @property
     def useful(self) -> bool:
         """True if the draws are finite and enough."""
-        free = self.flat.std(axis=0) > 0
-        enough = (self.effective >= LEAST_EFFECTIVE) | ~free
-        return bool(np.isfinite(self.z).all() and enough.all())
+        if not np.isfinite(self.z).all():
+            return False
+        return bool((self.effective >= LEAST_EFFECTIVE * len(self.z)).all())
 
     def contradict(
         self, mean: Float[np.ndarray, " size"], covariance: Float[np.ndarray, "size size"]
     ) -> bool:
         """Return whether 90 % intervals of the draws differ from those of a Gaussian.
 
-        The differences are larger than the sampling error of the draws explains.
+        The differences are larger than the sampling error of the draws explains, along a coordinate
+        or a principal direction of the covariance.
         """
-        half = Z95 * np.sqrt(np.diag(covariance))
-        off = np.quantile(self.flat, [0.05, 0.95], axis=0) - (mean + np.stack([-half, half]))
-        error = QUANTILE_ERROR * self.flat.std(axis=0) / np.sqrt(self.effective)
-        return bool((np.abs(off) > CONTRADICTION * error).any())
+        size = len(mean)
+        onto = np.eye(size)
+        if size > 1:
+            onto = np.concatenate([onto, np.linalg.eigh(covariance)[1]], axis=1)
+        turned = Draws(self.z @ onto)
+        half = Z95 * np.sqrt(np.einsum("ad,ab,bd->d", onto, covariance, onto))
+        ends = mean @ onto + np.stack([-half, half])
+        off = np.abs(np.quantile(turned.flat, [0.05, 0.95], axis=0) - ends)
+        error = QUANTILE_ERROR * turned.flat.std(axis=0) / np.sqrt(turned.effective)
+        return bool((off > CONTRADICTION * error).any())

@@ -1,6 +1,7 @@
 """Intervals and verdicts of every parameter and of ratios of parameters.
 
-Before a fit they are computed from the expected information, after it from the Laplace posterior.
+Before a fit they are computed from the expected information, after it from the Laplace
+approximation, or from draws of a chain.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -72,7 +73,8 @@ class Estimate:
         unit: unit of the parameter.
         doc: meaning of the parameter.
         labels: labels of a vector's elements, () for a scalar.
-        value: a float, or one per label [unit].
+        value: a float, or one per label [unit]; that of a fit is its mode, which is not in the
+            middle of the interval of a skewed posterior.
         std: a float, or one per label, None for a fixed parameter [unit].
         interval90: equal-tailed interval (low, high), or one such pair per label [unit].
         verdict: identified, weak, disputed, not_identified, at_bound or fixed; a vector has the

@@ -7,11 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slipid.infer.posterior import short_chain as module
 from slipid.infer.posterior.coordinates import Fitted
 from slipid.infer.posterior.short_chain import short_chain
 from slipid.infer.result import required
+from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 from tests.helpers import calibration
+from tests.infer.posterior.test_electric import parts
 
 pytestmark = pytest.mark.slow
 
@@ -40,3 +43,27 @@ def test_the_chain_is_the_same_for_the_same_seed(chained):
     problem, fitted = required(chained.problem), Fitted.of(chained)
     again = short_chain(problem, fitted, 0, Reporter(quiet=True))
     np.testing.assert_array_equal(again.z, chained.chain.z)
+
+
+def test_a_chain_that_refuses_electric_proposals_is_of_no_use(chained, monkeypatch):
+    drawn = module.electric_given_motion
+
+    def refusing(*given):
+        x, moved = drawn(*given)
+        return x, np.zeros_like(moved)
+
+    monkeypatch.setattr(module, "electric_given_motion", refusing)
+    problem, fitted = required(chained.problem), Fitted.of(chained)
+    assert short_chain(problem, fitted, 0, Reporter(quiet=True)) is None
+
+
+def test_a_fit_of_electric_numbers_alone_has_no_chain():
+    first, _, covariance = parts([Choice("*", free=False), Choice("motor.resistance", free=True)])
+    problem = first.problem
+    log_v = 2 * np.log(problem.noise.typical)
+    fitted = Fitted(np.asarray(first.anchor.z), log_v, covariance)
+    assert short_chain(problem, fitted, 0, Reporter(quiet=True)) is None
+
+
+def test_its_convergence_is_not_judged_by_packages_of_an_extra():
+    assert module.SHORT.most - module.SHORT.warm_up[-1] < 4

@@ -23,7 +23,7 @@ def test_independent_draws_all_count_and_walkers_at_rest_count_once():
 def test_a_gaussian_is_seldom_contradicted_and_a_wider_or_skewed_one_always():
     mean, unit = np.zeros(1), np.eye(1)
     found = [gaussian(seed).contradict(mean, unit) for seed in range(200)]
-    assert np.mean(found) < 0.15  # both ends stay within two standard errors
+    assert np.mean(found) < 0.1
     assert all(gaussian(seed, 1.5).contradict(mean, unit) for seed in range(20))
     skewed = [Draws(np.log(np.exp(gaussian(s).z) + 1.0)) for s in range(20)]
     assert all(
@@ -31,11 +31,20 @@ def test_a_gaussian_is_seldom_contradicted_and_a_wider_or_skewed_one_always():
     )
 
 
-def test_draws_that_are_few_or_not_finite_are_useless():
+def test_correlations_count_as_much_as_widths():
+    mean, covariance = np.zeros(2), np.array([[1.0, 0.9], [0.9, 1.0]])
+    assert gaussian(0, shape=(64, 8, 2)).contradict(mean, covariance)
+    root = np.linalg.cholesky(covariance)
+    right = [Draws(gaussian(s, shape=(64, 8, 2)).z @ root.T) for s in range(100)]
+    assert np.mean([one.contradict(mean, covariance) for one in right]) < 0.15
+
+
+def test_draws_of_walkers_that_do_not_move_or_disagree_or_are_not_finite_are_useless():
     assert gaussian(0).useful
-    assert not gaussian(0, shape=(16, 2, 1)).useful
+    still = np.broadcast_to(gaussian(0, shape=(64, 1, 1)).z, (64, 8, 1))
+    assert not Draws(still).useful
+    apart = gaussian(0).z + np.where(np.arange(64) < 32, -3.0, 3.0)[:, None, None]
+    assert not Draws(apart).useful
     broken = gaussian(0).z.copy()
     broken[3, 2] = np.nan
     assert not Draws(broken).useful
-    fixed = np.concatenate([gaussian(0).z, np.ones((64, 8, 1))], axis=-1)
-    assert Draws(fixed).useful
