@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 from slipid.infer.posterior.surrogate import Matrix, Surrogate
 from slipid.support.extras import require
 
-FORMAT = 7
+FORMAT = 8
 """Version of the block files; it must be increased if their content or the algorithm changes."""
 LEAST_ROWS = 20
 """Smallest number of exact densities from which a surrogate is learnt."""
@@ -43,6 +43,8 @@ class LogDensity:
         positive: True for coordinates that are logarithms of positive parameters.
         prior_mean, prior_std: mean and std of the Gaussian prior; the std is infinite without one.
         centre, covariance: mean and covariance of the Laplace approximation.
+        quotients: pairs of logarithms of which the residuals depend on the difference alone where
+            both are large.
     """
 
     names: tuple[str, ...]
@@ -55,6 +57,7 @@ class LogDensity:
     prior_std: Float[np.ndarray, " size"]
     centre: Float[np.ndarray, " size"]
     covariance: Matrix
+    quotients: tuple[tuple[int, int], ...] = ()
 
     @property
     def size(self) -> int:
@@ -63,6 +66,12 @@ class LogDensity:
     @property
     def groups(self) -> int:
         return len(self.depends)
+
+    def inputs(self, group: int) -> Int[np.ndarray, "2 input"]:
+        """Return the coordinate of each input of a group's surrogate, and the one subtracted."""
+        one = [(k, -1) for k in np.flatnonzero(self.depends[group]).tolist()]
+        two = [pair for pair in self.quotients if self.depends[group, list(pair)].all()]
+        return np.array([*one, *two], int).T
 
     def log_prob(self, x: Matrix) -> Matrix:
         """Return the log density (first column) and its terms, which emcee keeps as blobs."""

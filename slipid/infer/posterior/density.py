@@ -146,7 +146,15 @@ class Density:
             prior_std=np.asarray(self.anchor.prior_std)[at],
             centre=self.centre,
             covariance=self.covariance,
+            quotients=self._quotients(),
         )
+
+    def _quotients(self) -> tuple[tuple[int, int], ...]:
+        """Return the drag of rollers over their creep, which alone matters if both are large."""
+        place = {name: k for k, name in enumerate(self.names)}
+        partner = {name: name.replace(".roller_drag", ".roller_creep") for name in place}
+        pairs = [(name, other) for name, other in partner.items() if name != other]
+        return tuple((place[a], place[b]) for a, b in pairs if b in place)
 
     def terms(self, x: Float[np.ndarray, "walker size"]) -> Float[np.ndarray, "walker term"]:
         """Return the terms of every walker's log posterior: one per floor, then the shared term.

@@ -145,8 +145,8 @@ class Learner:
         def fitted(g: int) -> GroupSurrogate:
             parts = zip(*(rows[g] for rows in self._kept.values()), strict=True)
             rows = ResidualRows(*(np.concatenate(part) for part in parts))
-            at = np.flatnonzero(target.depends[g])
-            return group_surrogate(rows, at, target.positive, int((target.group == g).sum()))
+            own = int((target.group == g).sum())
+            return group_surrogate(rows, target.inputs(g), target.positive, own)
 
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             found = dict(zip(new, pool.map(evaluated, new.values()), strict=True))

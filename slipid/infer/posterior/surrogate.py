@@ -7,7 +7,8 @@ surrogate takes a small part of the time of an exact density.
 
 The inputs of the polynomials are standardised. For the logarithm x of a positive parameter p, the
 input is p / (p + q), with q at the upper end of its plausible values: residuals are nearly linear
-in a small drag or creep, and nearly linear in the inverse of a large one. With w the inputs of
+in a small drag or creep, and nearly linear in the inverse of a large one. Where two parameters are
+so large that only their quotient matters, the quotient is an input as well. With w the inputs of
 positive parameters that are known worst, t all inputs, and v = (t, all products of two elements of
 w), each polynomial has all terms of
 
@@ -54,7 +55,8 @@ class PolynomialInputs(NamedTuple):
     """Inputs of the polynomials of one group, as functions of the coordinates x.
 
     Attributes:
-        at: indices of the coordinates on which the group depends.
+        at: index of the coordinate of each input.
+        less: index of the coordinate that is subtracted, for the logarithm of a quotient; else -1.
         positive: True for logarithms of positive parameters.
         reference: log q of a positive parameter; a value that is subtracted from others.
         mean, std: mean and std over the rows that the surrogate was fitted to.
@@ -63,6 +65,7 @@ class PolynomialInputs(NamedTuple):
     """
 
     at: Int[np.ndarray, " input"]
+    less: Int[np.ndarray, " input"]
     positive: Bool[np.ndarray, " input"]
     reference: Float[np.ndarray, " input"]
     mean: Float[np.ndarray, " input"]
@@ -71,10 +74,15 @@ class PolynomialInputs(NamedTuple):
     high: Float[np.ndarray, " input"]
     wide: Int[np.ndarray, "2 pair"]
 
+    def logarithms(self, x: Numbers) -> Numbers:
+        """Return the coordinates of all inputs, or their differences for quotients."""
+        xp = np if isinstance(x, np.ndarray) else jnp
+        return x[:, self.at] - xp.where(self.less >= 0, x[:, self.less], 0.0)
+
     def plain(self, x: Numbers) -> Numbers:
         """Return the inputs before they are standardised (walker, input)."""
         xp = np if isinstance(x, np.ndarray) else jnp
-        off = x[:, self.at] - self.reference
+        off = self.logarithms(x) - self.reference
         return xp.where(self.positive, 0.5 + 0.5 * xp.tanh(0.5 * off), off)
 
     def all(self, x: Numbers) -> Numbers:
@@ -85,7 +93,7 @@ class PolynomialInputs(NamedTuple):
 
     def outside(self, x: Array) -> Float[Array, " walker"]:
         """Return half the squared distance outside the range, in units of `EDGE` of the range."""
-        own = x[:, self.at]
+        own = self.logarithms(x)
         beyond = own - jnp.clip(own, self.low, self.high)
         return 0.5 * jnp.sum((beyond / (EDGE * (self.high - self.low))) ** 2, axis=1)
 
@@ -189,7 +197,10 @@ class ResidualRows(NamedTuple):
 
 
 def group_surrogate(
-    rows: ResidualRows, at: Int[np.ndarray, " input"], positive: Bool[np.ndarray, " size"], own: int
+    rows: ResidualRows,
+    of: Int[np.ndarray, "2 input"],
+    positive: Bool[np.ndarray, " size"],
+    own: int,
 ) -> GroupSurrogate:
     """Return the surrogate of a group, fitted to exact rows by weighted least squares.
 
@@ -198,7 +209,7 @@ def group_surrogate(
 
     Args:
         rows: exact residuals.
-        at: indices of the coordinates on which the group depends.
+        of: `PolynomialInputs.at` and `PolynomialInputs.less`.
         positive: True for coordinates that are logarithms of positive parameters.
         own: number of the group's own coordinates.
     """
@@ -207,13 +218,13 @@ def group_surrogate(
     below = rows.log_likelihood.max() - rows.log_likelihood - 0.5 * own - 3
     weight = np.maximum((1 + np.maximum(below, 0) / DISTANCE) ** -2.0, LEAST_WEIGHT)
     weight /= weight.sum()
-    inputs = _inputs(rows.x, weight, at, positive[at])
+    inputs = _inputs(rows.x, weight, of, positive[of[0]])
     least = np.sort(below)[min(2 * own + 1, len(below) - 1)]  # a range needs some rows
-    likely = rows.x[below <= max(PLAUSIBLE, least)][:, at]
+    likely = inputs.logarithms(rows.x[below <= max(PLAUSIBLE, least)])
     low, high = likely.min(axis=0), likely.max(axis=0)
     margin = MARGIN * (high - low)
     inputs = inputs._replace(low=low - margin, high=high + margin)
-    v, count = inputs.all(rows.x), len(at)
+    v, count = inputs.all(rows.x), of.shape[1]
     pairs = _pairs(inputs)
     features = np.concatenate(
         [np.ones((len(v), 1)), v[:, :count], v[:, pairs[0]] * v[:, pairs[1]]], axis=1
@@ -239,18 +250,21 @@ def group_surrogate(
 def _inputs(
     x: Matrix,
     weight: Float[np.ndarray, " row"],
-    at: Int[np.ndarray, " input"],
+    of: Int[np.ndarray, "2 input"],
     positive: Bool[np.ndarray, " input"],
 ) -> PolynomialInputs:
     """Return inputs that have zero mean and unit variance over the rows."""
-    middle = weight @ x[:, at]
-    width = np.sqrt(weight @ (x[:, at] - middle) ** 2)
+    zero, one = np.zeros(of.shape[1]), np.ones(of.shape[1])
+    none = np.zeros((2, 0), int)
+    found = PolynomialInputs(of[0], of[1], positive, zero, zero, one, zero, one, none)
+    coordinates = found.logarithms(x)
+    middle = weight @ coordinates
+    width = np.sqrt(weight @ (coordinates - middle) ** 2)
     # The width of the other coordinates says nothing about how curved the residuals are in them.
     some = np.argsort(-width * positive, kind="stable")[: min(MOST_WIDE, int(positive.sum()))]
     pairs = list(combinations_with_replacement(np.sort(some), 2))
     wide = np.array(pairs, int).reshape(-1, 2).T
-    zero, one = np.zeros(len(at)), np.ones(len(at))
-    found = PolynomialInputs(at, positive, middle + UPPER_END * width, zero, one, zero, one, wide)
+    found = found._replace(reference=middle + UPPER_END * width, wide=wide)
     plain = found.plain(x)
     mean = weight @ plain
     return found._replace(mean=mean, std=np.sqrt(weight @ (plain - mean) ** 2))

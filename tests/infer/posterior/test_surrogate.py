@@ -18,7 +18,7 @@ from slipid.infer.posterior.proposals import (
     Hamiltonian,
     families,
 )
-from slipid.infer.posterior.surrogate import gaussian_root
+from slipid.infer.posterior.surrogate import ResidualRows, gaussian_root, group_surrogate
 from tests.infer.posterior.test_ensemble import gaussian, plateau
 
 pytestmark = pytest.mark.slow
@@ -174,3 +174,23 @@ def test_a_laplace_approximation_far_too_wide_still_gives_a_surrogate():
     )
     assert np.isfinite(found.value).all()
     assert np.isfinite(found.slope).all()
+
+
+def test_a_quotient_that_alone_matters_is_an_input():
+    """Of p s / (q + s), only p / q is known where both are large."""
+    random, slip = np.random.default_rng(0), np.linspace(0.05, 1.0, 12)
+    x = np.stack([random.normal(2.0, 2.0, 900), random.normal(2.0, 2.0, 900)], axis=1)
+    x[:, 0] = 0.5 * x[:, 1] + random.normal(0.0, 0.3, 900)  # along the ridge
+
+    def rows(x):
+        p, q = np.exp(x).T
+        y = 3.0 * np.log1p(p[:, None] * slip / (q[:, None] + slip))
+        return ResidualRows(x, y, np.zeros(len(x)))
+
+    def error(of):
+        found = group_surrogate(rows(x[:600]), np.array(of).T, np.ones(2, bool), 2)
+        new = rows(x[600:])
+        value = np.asarray(found.with_slope(jnp.asarray(new.x), 0.0).value)
+        return np.std(value - new.log_likelihood)
+
+    assert error([(0, -1), (1, -1), (0, 1)]) < 0.5 * error([(0, -1), (1, -1)])
