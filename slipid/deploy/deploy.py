@@ -18,6 +18,7 @@ from slipid.fitting.calibration.result import Calibration
 from slipid.infer.fit_file import IDENTIFIED, write_identified
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.result import Fit, draws
+from slipid.infer.verdicts.draws import some_of
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
 from slipid.model.kinematics import matrices, with_lengths
@@ -67,8 +68,7 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
     source: Source
     if isinstance(found, Posterior):
         fit, flat, source = found.fit, found.flat, "posterior"
-        rows = np.random.default_rng(0).choice(len(flat), DRAWS, replace=len(flat) < DRAWS)
-        vectors, center = flat[rows], flat.mean(axis=0)
+        vectors, center = some_of(flat, DRAWS), flat.mean(axis=0)
     else:
         fit, vectors, center = found, found.draws(DRAWS), found.z
         source = "laplace" if found.chain is None else "short_chain"

@@ -24,7 +24,7 @@ from slipid.fitting.variances import Search, Square
 from slipid.infer.held_out import HeldOut, doubted
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import LoadComparison, load_comparisons, marked
-from slipid.infer.verdicts.draws import Draws
+from slipid.infer.verdicts.draws import Draws, some_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
@@ -440,9 +440,7 @@ class Fit:
         """Return draws of the short chain, or of the Laplace approximation without one."""
         if self.chain is None:
             return draws(self.z, self.covariance, count, seed)
-        flat = self.chain.flat
-        rows = np.random.default_rng(seed).choice(len(flat), count, replace=len(flat) < count)
-        return flat[rows]
+        return some_of(self.chain.flat, count, seed)
 
 
 def required(evidence: Evidence | None) -> Evidence:

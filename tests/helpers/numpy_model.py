@@ -93,9 +93,9 @@ class Rival:
         drag = m["coulomb_friction"] * self.direction + m["viscous_friction"] * speed
         amps = (torque + drag) / (self.g.gear_ratio * m["efficiency"] * m["back_emf"])
         amps = np.sqrt(amps**2 + SMOOTHING_A**2) if not self.b.signed else amps
-        pieces = len(self.b.dt)
+        segments = len(self.b.dt)
         current = amps + m["current_offset"] - self.amps
-        return {"motion": self.motion(v, xi), "current": current.reshape(pieces, -1)}
+        return {"motion": self.motion(v, xi), "current": current.reshape(segments, -1)}
 
     def seen(self, d, v):
         c, s = np.cos(d[:, 2]), np.sin(d[:, 2])
@@ -274,9 +274,9 @@ class Posterior:
         xi, _ = self.rival.twist(v, self.twist + self.slope @ (z - self.z))
         white = np.einsum("nij,nj->ni", self.root, self.rival.motion(v, xi))
         squares = (white**2).sum()
-        for pieces, rows, factor in self.tied:  # what shared effects explain
+        for segments, rows, factor in self.tied:  # what shared effects explain
             squares -= (
-                solve_triangular(factor, white[pieces].ravel() @ rows, lower=True) ** 2
+                solve_triangular(factor, white[segments].ravel() @ rows, lower=True) ** 2
             ).sum()
         total = -0.5 * squares - 0.5 * (((x - self.mean) / self.std) ** 2).sum()
         total += self.factor * self.camera(v)

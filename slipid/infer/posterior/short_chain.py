@@ -31,10 +31,6 @@ PROPOSALS = 32
 """Number of proposals for the electric parameters of every draw."""
 
 
-LEAST_MOVED = 0.3
-"""Smallest fraction of moves that change a coordinate, for which draws are of use."""
-
-
 def short_chain(problem: Problem, fitted: Fitted, seed: int, report: Reporter) -> Draws | None:
     """Return draws of the posterior of a fit to runs on one floor each, None if they are useless.
 
@@ -53,18 +49,17 @@ def short_chain(problem: Problem, fitted: Fitted, seed: int, report: Reporter) -
         found = None
     if found is None or not found.useful:
         report.line(
-            "a short chain did not move enough: intervals are those of the Laplace approximation"
+            "a short chain did not follow the posterior: intervals are those of the Laplace "
+            "approximation"
         )
         return None
     return found
 
 
 def _drawn(first: Density, fitted: Fitted, seed: int, report: Reporter) -> Draws | None:
-    """Return the draws around a fit, None if too few moves or electric proposals are accepted."""
+    """Return the draws around a fit, None if too few electric proposals are accepted."""
     plan, problem = replace(SHORT, seed=seed), first.problem
     blocks = ensemble.extended(first.target(), plan, "for intervals", None, report)
-    if np.mean([b.accepted for b in blocks[plan.warm_up[-1] :]]) < LEAST_MOVED:
-        return None
     x = ensemble.chain(blocks, plan)[:, ::THINNED]
     ensembles, steps, walkers, size = x.shape
     x = x.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, size)

@@ -33,8 +33,6 @@ from slipid.infer.posterior.moves import Chains, SlopedDensity
 
 _RANGE = (-50.0, 10.0)
 """Range of log variances; beyond it, where leapfrog steps may end, residuals do not change."""
-
-"""Log variances of every chain."""
 Rows = dict[str, Float[np.ndarray, "segment m column"]]
 """Derivatives of residuals with respect to the search vector, then the residuals, by block."""
 

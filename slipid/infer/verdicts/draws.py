@@ -18,6 +18,14 @@ CONTRADICTION = 2.5
 which they contradict each other [standard error]."""
 
 
+def some_of(
+    flat: Float[np.ndarray, "draw size"], count: int, seed: int = 0
+) -> Float[np.ndarray, "some size"]:
+    """Return some draws at random, each once if there are enough."""
+    rows = np.random.default_rng(seed).choice(len(flat), count, replace=len(flat) < count)
+    return flat[rows]
+
+
 class Draws(NamedTuple):
     """Draws of the search vector, or of linear combinations of it, by the walkers of a chain."""
 

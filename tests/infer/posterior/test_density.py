@@ -52,11 +52,11 @@ FREE = [
 ]
 
 
-def stated():
+def stated(choices=FREE):
     truth = robot()
     w = made(truth, std=NOISE)
     w = replace(w, current_var=np.full_like(w.current_var, 1e-3))
-    return Problem(w, truth, FREE)
+    return Problem(w, truth, choices)
 
 
 @pytest.fixture(scope="module")
@@ -315,6 +315,19 @@ def test_gradients_are_those_of_finite_differences(problem):
     [found] = slope(d, x[None])
     numeric = (d.terms(x + h).sum(axis=1) - d.terms(x - h).sum(axis=1)) / 2e-5
     np.testing.assert_allclose(found, numeric, rtol=1e-4, atol=1e-3)
+
+
+def test_the_surrogate_of_a_floor_has_the_quotient_of_its_rollers_drag_and_creep():
+    """Floors of which both are fitted, and no other floor."""
+    choices = [Choice("*", free=False), Choice("surface.*.roller_drag", free=True)]
+    choices += [Choice("surface.soft.roller_creep", free=True)]
+    target = density(stated(choices), MOTION).target()
+    pairs = [tuple(target.names[k] for k in pair) for pair in target.quotients]
+    assert pairs == [("surface.soft.roller_drag", "surface.soft.roller_creep")]
+    for floor in range(target.groups):
+        at, less = target.inputs(floor)
+        assert (less >= 0).sum() == (target.depends[floor, target.quotients[0][1]])
+        assert set(at[less < 0]) == set(np.flatnonzero(target.depends[floor]))
 
 
 def test_a_single_floor_is_a_single_group():

@@ -177,7 +177,7 @@ def test_a_laplace_approximation_far_too_wide_still_gives_a_surrogate():
 
 
 def test_a_quotient_that_alone_matters_is_an_input():
-    """Of p s / (q + s), only p / q is known where both are large."""
+    """Residuals that depend on p s / (q + s) depend on p / q alone where both are large."""
     random, slip = np.random.default_rng(0), np.linspace(0.05, 1.0, 12)
     x = np.stack([random.normal(2.0, 2.0, 900), random.normal(2.0, 2.0, 900)], axis=1)
     x[:, 0] = 0.5 * x[:, 1] + random.normal(0.0, 0.3, 900)  # along the ridge

@@ -82,12 +82,12 @@ def drawn(part, start, number, chains=4):
 
 
 def assert_quantiles(x, grid, log_density, effective):
-    """The draws' quantiles have the probabilities of a density on a grid, to five std errors."""
+    """The draws' quantiles have the probabilities of a density on a grid, to three std errors."""
     weight = np.exp(log_density - log_density.max())
     cumulated = np.cumsum(weight) / weight.sum()
     found = np.interp(np.quantile(x, PROBABILITIES), grid, cumulated)
     error = np.sqrt(PROBABILITIES * (1 - PROBABILITIES) / effective)
-    np.testing.assert_allclose((found - PROBABILITIES) / error, 0.0, atol=5.0)
+    np.testing.assert_allclose((found - PROBABILITIES) / error, 0.0, atol=3.0)
 
 
 def log_prior(x):
