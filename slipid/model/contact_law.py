@@ -111,13 +111,8 @@ class ContactSurface(eqx.Module):
     drag_exponent: Array = positive(
         "1", "p", "power of the load that drag grows with", start=1.15, spread=0.25
     )
-    knee_width: Array = known(
-        "1",
-        "h",
-        "width of the knee between creep and full sliding",
-        start=KNEE,
-        lower=0.0,
-        spread=0.7,
+    knee_width: Array = positive(
+        "1", "h", "width of the knee between creep and full sliding", start=KNEE, spread=0.7
     )
     load_bias: Array = parameter(
         "1",
