@@ -21,7 +21,7 @@ EXTRA = (
 """Packages that extras install."""
 DRAW_OR_SAMPLE = {
     "slipid.app.sample",
-    *(f"slipid.infer.posterior.{name}" for name in ("ensemble", "proposals", "sample")),
+    *(f"slipid.infer.posterior.{name}" for name in ("ensemble", "learning", "proposals", "sample")),
     *(f"slipid.lab.{name}" for name in ("paper2021.plots", "trial.plots")),
 }
 """Modules outside `slipid.plots` that need such a package: commands look for it before."""
