@@ -12,6 +12,8 @@ from slipid.support.extras import require
 
 FORMAT = 7
 """Version of the block files; it must be increased if their content or the algorithm changes."""
+LEAST_ROWS = 20
+"""Smallest number of exact densities from which a surrogate is learnt."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 
 
@@ -82,8 +84,8 @@ class Plan:
         most: number of blocks after which sampling ends even without convergence.
         spread: distance from the fit up to which the first surrogate is learnt, and from which
             trajectories on it start [std]. A large distance finds modes away from the fit.
-        rows: number of exact densities from which the first surrogate is learnt; later ones are
-            learnt from up to three times as many.
+        rows: number of exact densities from which the first surrogate is learnt, at least 20;
+            later ones are learnt from up to four times as many.
         r_hat: upper limit of R-hat over ensembles for every coordinate.
         steps_per_tau: lower limit of steps per autocorrelation time for every coordinate.
         least_draws: lower limit of effective draws for every coordinate.
@@ -103,6 +105,8 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if self.rows < LEAST_ROWS:
+            raise ValueError(f"{self.rows} rows; expected at least {LEAST_ROWS}")
         if self.most <= self.warm_up[-1]:
             least = self.warm_up[-1] + 1
             raise ValueError(

@@ -177,7 +177,8 @@ class Density:
     ) -> tuple[Float[np.ndarray, "walker row"], Float[np.ndarray, " walker"]]:
         """Return whitened residuals y of a floor and the remainder c of its log likelihood.
 
-        The log likelihood is c - |y|^2 / 2; c depends on the camera's parameters only.
+        The log likelihood is c - |y|^2 / 2; c depends on the parameters of the
+        camera, and on the resistance if voltages were logged.
         """
         mine = None if held is None else held.on(self._segments[floor])
         y, c = [], []

@@ -83,10 +83,11 @@ def _expected(done: int, found: diagnosis.Diagnosis | None, plan: Plan) -> int:
 
     Effective draws grow in proportion to the steps.
     """
-    after = USUAL_BLOCKS
-    if found:
-        after = int(found.excess * found.steps / plan.block) + 1
-    return min(plan.most, max(done + 1, plan.warm_up[-1] + after))
+    if found is None:
+        return min(plan.most, max(done + 1, plan.warm_up[-1] + USUAL_BLOCKS))
+    # Without a single move the excess is infinite.
+    after = np.nan_to_num(found.excess * found.steps / plan.block, nan=np.inf)
+    return int(min(plan.most, max(done + 1, plan.warm_up[-1] + after + 1)))
 
 
 def chain(blocks: Sequence[ChainBlock], plan: Plan) -> Chain:
@@ -97,7 +98,7 @@ def chain(blocks: Sequence[ChainBlock], plan: Plan) -> Chain:
 def _block(learner: Learner, blocks: list[ChainBlock]) -> ChainBlock:
     """Sample the next block of a chain; the ensembles run in parallel threads."""
     target, plan = learner.target, learner.plan
-    known = next((b.learnt for b in reversed(blocks) if b.learnt), None) or learner.first()
+    known = next((b.learnt for b in reversed(blocks) if b.learnt), None) or learner.first
     states = _begin(plan, blocks, known)
     stop = threading.Event()
 

@@ -7,13 +7,13 @@ there, its trajectories go there and the next one is corrected.
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cached_property, partial
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from slipid.infer.posterior.blocks import Chain, Learnt, LogDensity, Plan
+from slipid.infer.posterior.blocks import LEAST_ROWS, Chain, Learnt, LogDensity, Plan
 from slipid.infer.posterior.proposals import TEMPERATURE, families, wander
 from slipid.infer.posterior.surrogate import (
     GroupSurrogate,
@@ -41,7 +41,7 @@ FROM_CHAIN = 1 / 3
 """Largest fraction of new rows that are positions of the chain."""
 NEAR, WIDE_SHARE = (0.05, 1.2), 0.15
 """Range of the squared scale of the first rows [std^2], and fraction of rows with other scales."""
-CHUNK = 20
+CHUNK = LEAST_ROWS
 """Number of vectors whose rows are evaluated and stored together."""
 LAPLACE_WEIGHT = 1e-3
 """Weight of the Laplace covariance that is added to the covariance of draws."""
@@ -59,8 +59,9 @@ class Learner:
         self.target, self.plan = target, plan
         self._kept: dict[bytes, list[Rows]] = {}
 
+    @cached_property
     def first(self) -> Learnt:
-        """Return the surrogate learnt around the Laplace approximation.
+        """The surrogate learnt around the Laplace approximation.
 
         Most rows are where it is plausible, others further away, where there may be other modes.
         """

@@ -61,15 +61,19 @@ class Family(NamedTuple):
 
     def summed(self, terms: Float[np.ndarray, "walker term"]) -> Float[np.ndarray, "walker block"]:
         """Return sums of the terms of every block."""
-        return terms @ (self.of_term[:, None] == np.arange(self.blocks)).astype(float)
+        each = [terms[:, self.of_term == block].sum(axis=1) for block in range(self.blocks)]
+        return np.stack(each, axis=1)
 
 
 def families(target: LogDensity) -> list[Family]:
     """Return the family of all coordinates, then that of the groups, if these share any."""
-    terms = np.append(np.arange(target.groups), -1)
-    everything = Family(np.zeros_like(target.group), np.zeros_like(terms))
-    shares = (target.group < 0).any() and (target.group >= 0).any()
-    return [everything, Family(target.group, terms)] if shares else [everything]
+    everything = Family(np.zeros_like(target.group), np.zeros(target.groups + 1, int))
+    known = np.unique(target.group[target.group >= 0])  # a group may have no coordinate of its own
+    if not len(known) or (target.group >= 0).all():
+        return [everything]
+    number = np.append(np.full(target.groups, -1), -1)
+    number[known] = np.arange(len(known))
+    return [everything, Family(number[target.group], number)]
 
 
 class Proposal(NamedTuple):
@@ -105,9 +109,8 @@ class FamilyMove(Move):
             old = state.coords[mine]
             new, factor = self.proposed(old, state.coords[np.setdiff1d(order, mine)], random)
             terms = self.target.terms(new)
-            gain = family.summed(np.where(family.of_term < 0, 0.0, terms))
-            gain -= family.summed(state.blobs[mine])
-            gain += factor
+            with np.errstate(invalid="ignore"):  # a place whose density is zero
+                gain = family.summed(terms) - family.summed(state.blobs[mine]) + factor
             took = np.log(random.uniform(size=gain.shape)) < np.where(np.isnan(gain), -1e9, gain)
             moves = np.append(took, np.zeros((len(took), 1), bool), axis=1)  # -1: stays
             state.coords[mine] = np.where(moves[:, family.block], new, old)
@@ -245,9 +248,8 @@ def wander(
     def at(u: Array, p: Array) -> _Phase:
         found = surrogate.with_slope(jnp.asarray(surrogate.centre + u @ surrogate.root.T), learning)
         cool = 1 + learning * (1 / TEMPERATURE - 1)
-        return _Phase(
-            u, p, cool * found.value @ of_term, cool * found.slope @ surrogate.root * free
-        )
+        value = jnp.sum(jnp.where(of_term > 0, found.value[:, :, None], 0.0), axis=1)
+        return _Phase(u, p, cool * value, cool * found.slope @ surrogate.root * free)
 
     def trajectory(start: _Phase, key: Array) -> tuple[_Phase, Array]:
         of_momentum, of_step, of_end = jax.random.split(key, 3)
@@ -272,7 +274,8 @@ def wander(
     u = jnp.linalg.solve(surrogate.root, (x - surrogate.centre).T).T
     first = at(u, jnp.zeros_like(u))
     last, share = jax.lax.scan(trajectory, first, jax.random.split(key, TRAJECTORIES))
-    ends = jnp.where(free > 0, surrogate.centre + last.u @ surrogate.root.T, x)
+    moved = free * (last.u != u).any(axis=1, keepdims=True) > 0
+    ends = jnp.where(moved, surrogate.centre + last.u @ surrogate.root.T, x)
     return Wandered(ends, first.value, last.value, jnp.mean(share))
 
 

@@ -46,8 +46,8 @@ RIDGE = 1e-8
 """Ridge penalty of the polynomials' coefficients, for features of unit mean square."""
 DISTANCE = 10.0
 """Loss of log density over which the weight of a row falls."""
-LEAST_WEIGHT = 1e-4
-"""Weight of a row that is very far from the best one."""
+LEAST_WEIGHT, FURTHEST = 1e-4, 1e4
+"""Weight of a row that is far from the best one, and loss beyond which a row is not used."""
 
 
 class Inputs(NamedTuple):
@@ -96,7 +96,7 @@ class GroupSurrogate(NamedTuple):
     Attributes:
         inputs: inputs of the polynomials.
         constant, linear, square: a, b and C of every component of y, and of c as the last one.
-        rest: sum of squares of the residuals that no component describes.
+        rest: sum of squares of the residuals that no component describes, less twice the mean c.
     """
 
     inputs: Inputs
@@ -202,13 +202,14 @@ def group_surrogate(
         positive: True for coordinates that are logarithms of positive parameters.
         own: number of the group's own coordinates.
     """
-    finite = np.isfinite(rows.y).all(axis=1) & np.isfinite(rows.c)
-    rows = Rows(*(part[finite] for part in rows))
+    possible = rows.log_likelihood > np.nanmax(rows.log_likelihood) - FURTHEST
+    rows = Rows(*(part[possible] for part in rows))
     below = rows.log_likelihood.max() - rows.log_likelihood - 0.5 * own - 3
     weight = np.maximum((1 + np.maximum(below, 0) / DISTANCE) ** -2.0, LEAST_WEIGHT)
     weight /= weight.sum()
     inputs = _inputs(rows.x, weight, at, positive[at])
-    likely = rows.x[below < PLAUSIBLE][:, at]
+    least = np.sort(below)[min(2 * own + 1, len(below) - 1)]  # a range needs some rows
+    likely = rows.x[below <= max(PLAUSIBLE, least)][:, at]
     low, high = likely.min(axis=0), likely.max(axis=0)
     margin = MARGIN * (high - low)
     inputs = inputs._replace(low=low - margin, high=high + margin)
@@ -219,7 +220,8 @@ def group_surrogate(
     )
     best = rows.y[np.argmax(rows.log_likelihood)]
     span = _components((rows.y - best) * np.sqrt(weight)[:, None])
-    wanted = np.concatenate([rows.y @ span, rows.c[:, None]], axis=1)
+    middle = rows.c.mean()  # c is small in single precision then
+    wanted = np.concatenate([rows.y @ span, rows.c[:, None] - middle], axis=1)
     scale = np.sqrt(weight @ features**2)
     scaled = features / scale * np.sqrt(weight)[:, None]
     normal = scaled.T @ scaled + RIDGE * np.diag(np.arange(len(scale)) > 0)
@@ -230,7 +232,7 @@ def group_surrogate(
     square = np.zeros((len(coef), v.shape[1], v.shape[1]))
     for a, b in (pairs, pairs[::-1]):  # half of each coefficient on either side of the diagonal
         square[:, a, b] += 0.5 * coef[:, count + 1 :]
-    rest = np.sum((best - span @ (span.T @ best)) ** 2)
+    rest = np.sum((best - span @ (span.T @ best)) ** 2) - 2 * middle
     return GroupSurrogate(inputs, coef[:, 0], linear, square, np.asarray(rest))
 
 

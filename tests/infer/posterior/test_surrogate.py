@@ -32,7 +32,7 @@ def exact():
     target, mean, _ = gaussian()
     root = gaussian_root(target.covariance / 0.6, target.group)
     x = mean + np.random.RandomState(1).standard_normal((COPIES, 8)) @ root.T
-    return target, Learner(target, PLAN).first(), x, (mean, root)
+    return target, Learner(target, PLAN).first, x, (mean, root)
 
 
 def state_of(target, x):
@@ -65,7 +65,7 @@ def test_a_root_has_the_covariance_of_groups_that_are_independent_given_what_the
 
 def test_slopes_are_those_of_the_values():
     target, _, _ = plateau()
-    surrogate = Learner(target, PLAN).first().surrogate
+    surrogate = Learner(target, PLAN).first.surrogate
     x = target.centre + 0.3 * np.random.default_rng(0).standard_normal((16, 2))
     x[0] += 30.0  # outside the range of plausible rows
 
@@ -144,3 +144,29 @@ def test_blocks_are_stored_with_what_was_learnt(exact):
     values = (of.surrogate.with_slope(jnp.asarray(x[:16])).value for of in (again, learnt))
     np.testing.assert_array_equal(*values)
     np.testing.assert_array_equal(again.places, learnt.places)
+
+
+def test_a_group_of_zero_density_is_refused_alone():
+    terms = np.array([[-np.inf, -1.0, 0.0], [-1.0, -2.0, 0.0]])
+    target, _, _ = gaussian()
+    np.testing.assert_array_equal(families(target)[1].summed(terms), terms[:, :2])
+
+
+def test_groups_without_coordinates_of_their_own_do_not_move():
+    target, _, _ = gaussian()
+    depends = np.ones((4, 8), bool)
+    more = replace(target, group=np.where(target.group == 1, 2, target.group), depends=depends)
+    of_groups = families(more)[1]
+    assert of_groups.blocks == 2
+    np.testing.assert_array_equal(of_groups.of_term, [0, -1, 1, -1, -1])
+    np.testing.assert_array_equal(of_groups.block, target.group)
+
+
+def test_a_laplace_approximation_far_too_wide_still_gives_a_surrogate():
+    target, mean, _ = gaussian()
+    wide = replace(target, centre=mean, covariance=1e4 * target.covariance)
+    found = Learner(wide, PLAN).first.surrogate.with_slope(
+        jnp.asarray(mean[None] + np.zeros((16, 1)))
+    )
+    assert np.isfinite(found.value).all()
+    assert np.isfinite(found.slope).all()
