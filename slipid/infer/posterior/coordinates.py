@@ -19,7 +19,7 @@ from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
 """Parts of a posterior: motion parameters, electric ones given the motion, all parameters."""
-Rows = TypeVar("Rows")
+Part = TypeVar("Part")
 OfFloor = TypeVar("OfFloor", SharedEffects, EffectPosterior)
 
 _ROUNDS = 3
@@ -161,7 +161,7 @@ class Anchor(eqx.Module):
         segments = len(self.batch.surface)
         mine = np.flatnonzero(np.asarray(self.batch.surface) == floor)
 
-        def rows(tree: Rows) -> Rows:
+        def rows(tree: Part) -> Part:
             # The lag of the camera and the scatter without currents are common to all segments.
             return jax.tree.map(lambda x: x[mine] if x.shape[:1] == (segments,) else x, tree)
 

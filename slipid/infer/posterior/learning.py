@@ -18,7 +18,7 @@ from slipid.infer.posterior.proposals import TEMPERATURE, families, wander
 from slipid.infer.posterior.surrogate import (
     GroupSurrogate,
     Matrix,
-    Rows,
+    ResidualRows,
     Surrogate,
     gaussian_root,
     group_surrogate,
@@ -57,7 +57,7 @@ class Learner:
 
     def __init__(self, target: LogDensity, plan: Plan):
         self.target, self.plan = target, plan
-        self._kept: dict[bytes, list[Rows]] = {}
+        self._kept: dict[bytes, list[ResidualRows]] = {}
 
     @cached_property
     def first(self) -> Learnt:
@@ -139,12 +139,12 @@ class Learner:
         chunks = np.split(design, len(design) // CHUNK)
         new = {c.tobytes(): c for c in chunks if c.tobytes() not in self._kept}
 
-        def evaluated(x: Matrix) -> list[Rows]:
-            return [Rows(x, *target.rows(x, g)) for g in range(target.groups)]
+        def evaluated(x: Matrix) -> list[ResidualRows]:
+            return [ResidualRows(x, *target.rows(x, g)) for g in range(target.groups)]
 
         def fitted(g: int) -> GroupSurrogate:
             parts = zip(*(rows[g] for rows in self._kept.values()), strict=True)
-            rows = Rows(*(np.concatenate(part) for part in parts))
+            rows = ResidualRows(*(np.concatenate(part) for part in parts))
             at = np.flatnonzero(target.depends[g])
             return group_surrogate(rows, at, target.positive, int((target.group == g).sum()))
 

@@ -50,8 +50,8 @@ LEAST_WEIGHT, FURTHEST = 1e-4, 1e4
 """Weight of a row that is far from the best one, and loss beyond which a row is not used."""
 
 
-class Inputs(NamedTuple):
-    """Inputs of the polynomials of one group, as functions of the coordinates x.
+class PolynomialInputs(NamedTuple):
+    """PolynomialInputs of the polynomials of one group, as functions of the coordinates x.
 
     Attributes:
         at: indices of the coordinates on which the group depends.
@@ -99,7 +99,7 @@ class GroupSurrogate(NamedTuple):
         rest: sum of squares of the residuals that no component describes, less twice the mean c.
     """
 
-    inputs: Inputs
+    inputs: PolynomialInputs
     constant: Float[np.ndarray, " component"]
     linear: Float[np.ndarray, "component v"]
     square: Float[np.ndarray, "component v v"]
@@ -166,17 +166,17 @@ class Surrogate(NamedTuple):
     @staticmethod
     def of_leaves(leaves: Sequence[np.ndarray], groups: int) -> "Surrogate":
         """Return the surrogate whose arrays `jax.tree.leaves` has listed."""
-        count = len(Inputs._fields), len(GroupSurrogate._fields) - 1
+        count = len(PolynomialInputs._fields), len(GroupSurrogate._fields) - 1
         ends = np.cumsum([0, *count * groups]).tolist()
         parts = [leaves[a:b] for a, b in pairwise(ends)]
         each = [
-            GroupSurrogate(Inputs(*inputs), *rest)
+            GroupSurrogate(PolynomialInputs(*inputs), *rest)
             for inputs, rest in zip(parts[::2], parts[1::2], strict=True)
         ]
         return Surrogate(tuple(each), *leaves[ends[-1] :])
 
 
-class Rows(NamedTuple):
+class ResidualRows(NamedTuple):
     """Exact residuals y and remainders c of one group at the vectors x, and the weight of each."""
 
     x: Matrix
@@ -189,7 +189,7 @@ class Rows(NamedTuple):
 
 
 def group_surrogate(
-    rows: Rows, at: Int[np.ndarray, " input"], positive: Bool[np.ndarray, " size"], own: int
+    rows: ResidualRows, at: Int[np.ndarray, " input"], positive: Bool[np.ndarray, " size"], own: int
 ) -> GroupSurrogate:
     """Return the surrogate of a group, fitted to exact rows by weighted least squares.
 
@@ -203,7 +203,7 @@ def group_surrogate(
         own: number of the group's own coordinates.
     """
     possible = rows.log_likelihood > np.nanmax(rows.log_likelihood) - FURTHEST
-    rows = Rows(*(part[possible] for part in rows))
+    rows = ResidualRows(*(part[possible] for part in rows))
     below = rows.log_likelihood.max() - rows.log_likelihood - 0.5 * own - 3
     weight = np.maximum((1 + np.maximum(below, 0) / DISTANCE) ** -2.0, LEAST_WEIGHT)
     weight /= weight.sum()
@@ -241,7 +241,7 @@ def _inputs(
     weight: Float[np.ndarray, " row"],
     at: Int[np.ndarray, " input"],
     positive: Bool[np.ndarray, " input"],
-) -> Inputs:
+) -> PolynomialInputs:
     """Return inputs that have zero mean and unit variance over the rows."""
     middle = weight @ x[:, at]
     width = np.sqrt(weight @ (x[:, at] - middle) ** 2)
@@ -250,13 +250,13 @@ def _inputs(
     pairs = list(combinations_with_replacement(np.sort(some), 2))
     wide = np.array(pairs, int).reshape(-1, 2).T
     zero, one = np.zeros(len(at)), np.ones(len(at))
-    found = Inputs(at, positive, middle + UPPER_END * width, zero, one, zero, one, wide)
+    found = PolynomialInputs(at, positive, middle + UPPER_END * width, zero, one, zero, one, wide)
     plain = found.plain(x)
     mean = weight @ plain
     return found._replace(mean=mean, std=np.sqrt(weight @ (plain - mean) ** 2))
 
 
-def _pairs(inputs: Inputs) -> Int[np.ndarray, "2 term"]:
+def _pairs(inputs: PolynomialInputs) -> Int[np.ndarray, "2 term"]:
     """Return pairs of elements of v, one for each different product of inputs."""
     factors = [(k,) for k in range(len(inputs.at))] + [tuple(p) for p in inputs.wide.T.tolist()]
     terms: dict[tuple[int, ...], tuple[int, int]] = {}
