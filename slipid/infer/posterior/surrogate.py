@@ -51,7 +51,7 @@ LEAST_WEIGHT, FURTHEST = 1e-4, 1e4
 
 
 class PolynomialInputs(NamedTuple):
-    """PolynomialInputs of the polynomials of one group, as functions of the coordinates x.
+    """Inputs of the polynomials of one group, as functions of the coordinates x.
 
     Attributes:
         at: indices of the coordinates on which the group depends.
