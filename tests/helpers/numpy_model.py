@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from slipid.fitting.likelihood import SMOOTHING_A
+from slipid.fitting.variances import DEGREES
 from slipid.model import contact, contact_law
 from slipid.parameter import entries, share_basis
 
@@ -264,6 +265,8 @@ class Posterior:
         self.slope = np.asarray(a.twist_slope).reshape(-1, 3, len(self.z))
         self.root = np.asarray(a.root["motion"]) * np.asarray(a.scale["motion"])[:, None, None]
         self.pose = np.asarray(a.batch.pose)
+        m = self.root.shape[-1]
+        self.factor = (DEGREES + m) / (DEGREES + m + 2)  # of a Student t's information
         self.mean, self.std = self.space.prior_mean[self.at], np.asarray(a.prior_std)[self.at]
         self.tied = []
         for tie in a.effects:
@@ -280,10 +283,13 @@ class Posterior:
         v = self.numbers(z)
         xi, _ = self.rival.twist(v, self.twist + self.slope @ (z - self.z))
         white = np.einsum("nij,nj->ni", self.root, self.rival.motion(v, xi))
-        told = (white**2).sum()
+        squares = (white**2).sum()
         for pieces, rows, factor in self.tied:  # what shared effects explain
-            told -= (solve_triangular(factor, white[pieces].ravel() @ rows, lower=True) ** 2).sum()
-        total = -0.5 * told - 0.5 * (((x - self.mean) / self.std) ** 2).sum() + self.camera(v)
+            squares -= (
+                solve_triangular(factor, white[pieces].ravel() @ rows, lower=True) ** 2
+            ).sum()
+        total = -0.5 * squares - 0.5 * (((x - self.mean) / self.std) ** 2).sum()
+        total += self.factor * self.camera(v)
         return total if np.isfinite(total) else -np.inf
 
     def numbers(self, z):

@@ -116,7 +116,7 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """What Hamiltonian moves follow, and from which it can be learnt anew.
+    """Surrogate that Hamiltonian moves follow, and the rows from which the next one is learnt.
 
     Attributes:
         surrogate: surrogate of the log density.

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from slipid.fitting import likelihood as lk
 from slipid.fitting.problem import Problem
@@ -50,10 +50,6 @@ class HeldMotion(NamedTuple):
 
     z: Float[Array, "*walker free"]
     motor_force: Float[Array, "*walker segment window wheel 2"]
-
-    def on(self, segments: Int[np.ndarray, " some"]) -> "HeldMotion":
-        """Return the motion of many walkers in some segments only."""
-        return self._replace(motor_force=self.motor_force[:, segments])
 
 
 class WhitenedResiduals(NamedTuple):
@@ -96,8 +92,6 @@ class Density:
         self.structure, self.group, self.touched = coordinates(problem, fitted, part)
         self.names = tuple(problem.space.names[k] for k in self.structure)
         self.anchor = Anchor.at(problem, fitted)
-        floors = np.asarray(problem.batch.surface)
-        self._segments = [np.flatnonzero(floors == k) for k in range(len(self.floors))]
         self._on_floor = [self.anchor.on_floor(k) for k in range(len(self.floors))]
         # The first density with these coordinates compiles the functions for all later ones.
         form = part, self.names, self.group.tobytes()
@@ -153,40 +147,32 @@ class Density:
             covariance=self.covariance,
         )
 
-    def terms(
-        self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
-    ) -> Float[np.ndarray, "walker term"]:
+    def terms(self, x: Float[np.ndarray, "walker size"]) -> Float[np.ndarray, "walker term"]:
         """Return the terms of every walker's log posterior: one per floor, then the shared term.
 
-        The electric part needs the motion of each walker, as returned by `hold`.
+        The electric part has no terms, since it depends on the motion of each walker (`log_prob`).
         """
         out = np.zeros((len(x), len(self.floors) + 1))
         prior = -0.5 * np.asarray(self._pull(self.anchor, x)) ** 2
         np.add.at(out.T, self.group, prior.T)  # group -1 is the last term
         for floor in range(len(self.floors)):
-            y, remainder = self.rows(x, floor, held)
+            y, remainder = self.rows(x, floor)
             out[:, floor] += remainder - 0.5 * (y**2).sum(axis=1)
         out[~np.isfinite(out)] = -np.inf
         return out
 
     def rows(
-        self,
-        x: Float[np.ndarray, "walker size"],
-        floor: int,
-        held: HeldMotion | None = None,
+        self, x: Float[np.ndarray, "walker size"], floor: int
     ) -> tuple[Float[np.ndarray, "walker row"], Float[np.ndarray, " walker"]]:
         """Return whitened residuals y of a floor and the remainder c of its log likelihood.
 
-        The log likelihood is c - |y|^2 / 2; c depends on the parameters of the
-        camera, and on the resistance if voltages were logged.
+        The log likelihood is c - |y|^2 / 2.
         """
-        mine = None if held is None else held.on(self._segments[floor])
         y, c = [], []
         # Batches of one size only, so that one compiled function serves any number of walkers.
         for k in range(0, len(x), _BATCH):
             some = np.minimum(np.arange(k, k + _BATCH), len(x) - 1)
-            of = None if mine is None else jax.tree.map(lambda leaf, at=some: leaf[at], mine)
-            found = self.mapped(Density.whitened, x[some], of, floor=floor)
+            found = self.mapped(Density.whitened, x[some], None, floor=floor)
             y.append(np.asarray(found.rows)[: len(x) - k])
             c.append(np.asarray(found.remainder)[: len(x) - k])
         return np.concatenate(y), np.concatenate(c)

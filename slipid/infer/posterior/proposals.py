@@ -84,26 +84,20 @@ class Proposal(NamedTuple):
 
 
 class FamilyMove(Move):
-    """Metropolis-Hastings move of a family of coordinates.
-
-    Attributes:
-        family: the coordinates.
-        accepted: fraction of accepted blocks in every step.
-    """
+    """Metropolis-Hastings move of a family of coordinates."""
 
     halves = 1
     """Number of subsets of walkers moved in turn; 2 if a proposal uses walkers that stay fixed."""
 
     def __init__(self, target: LogDensity, family: Family):
         self.target, self.family = target, family
-        self.accepted: list[float] = []
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> Proposal:
         raise NotImplementedError
 
     def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
         random, count, family = model.random, len(state.coords), self.family
-        accepted, taken = np.zeros(count, bool), []
+        accepted = np.zeros(count, bool)
         order = random.permutation(count) if self.halves == 2 else np.arange(count)
         for mine in np.array_split(order, self.halves):
             old = state.coords[mine]
@@ -117,8 +111,6 @@ class FamilyMove(Move):
             state.blobs[mine] = np.where(moves[:, family.of_term], terms, state.blobs[mine])
             state.log_prob[mine] = state.blobs[mine].sum(axis=1)
             accepted[mine] = took.any(axis=1)
-            taken.append(took.mean())
-        self.accepted.append(float(np.mean(taken)))
         return state, accepted
 
 
@@ -155,16 +147,16 @@ class CoordinateWalk(FamilyMove):
     def __init__(self, target: LogDensity, family: Family, surrogate: Surrogate):
         super().__init__(target, family)
         self.root = surrogate.root
+        self.alone = np.diag(np.sqrt((self.root**2).sum(axis=1)))
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> Proposal:
         new, rows = x.copy(), np.arange(len(x))
-        alone = np.diag(np.sqrt((self.root**2).sum(axis=1)))
         for block in range(self.family.blocks):
             own = self.family.coordinates(block)
             which = random.choice(own, len(x))
             reach = 10 ** random.uniform(-0.5, 1.0, len(x)) * random.standard_normal(len(x))
             along = random.uniform(size=len(x)) < ALONE_SHARE
-            step = np.where(along[:, None], alone[:, which].T, self.root[:, which].T)
+            step = np.where(along[:, None], self.alone[:, which].T, self.root[:, which].T)
             new[np.ix_(rows, own)] += (reach[:, None] * step)[:, own]
         return Proposal(new, np.zeros((len(x), self.family.blocks)))
 

@@ -177,7 +177,7 @@ class Surrogate(NamedTuple):
 
 
 class ResidualRows(NamedTuple):
-    """Exact residuals y and remainders c of one group at the vectors x, and the weight of each."""
+    """Exact residuals y and remainders c of one group at the vectors x."""
 
     x: Matrix
     y: Matrix

@@ -137,7 +137,10 @@ def sensitivity(found: Sequence[LoadComparison]) -> str:
             f"with a probability of {100 * POWER:.0f} %"
         )
     if unseen:
-        parts.append(f"{_listed(unseen)} the comparison of loads says nothing")
+        parts.append(
+            "the comparison of loads says nothing where only larger differences would have been "
+            f"reported: {_listed(unseen)}"
+        )
     return "; ".join(parts)
 
 

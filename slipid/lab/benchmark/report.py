@@ -191,7 +191,7 @@ def classifiers(found: Content) -> ExtraTable:
         title = f"{title}; failed: {'; '.join(lost)}"
     rows = [row for row in found["rows"] if row["after"]]
     if any(after["accuracy"][1] is None for row in rows for after in row["after"]):
-        title = f"{title}; -: {TOO_FEW}, or all are alike"
+        title = f"{title}; -: {TOO_FEW}, or all answers are right, or none is"
     seconds = [after["seconds"] for after in rows[0]["after"]] if rows else []
     head = ("correct, %, after", *(f"{x:g} s" for x in seconds), "points above slipid", "numbers")
     body: list[tuple[str, ...]] = []

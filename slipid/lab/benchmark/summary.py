@@ -140,8 +140,11 @@ class Jackknife:
         NaN values are ignored too, unless a floor's only values are those of the cluster that is
         left out: its mean is then unknown.
         """
-        known = [k for k in range(len(self.names)) if np.isfinite(x[self.floor == k]).any()]
-        return np.mean([self.on(x, k) for k in known], axis=0)
+        return np.mean([self.on(x, k) for k in self.known(x)], axis=0)
+
+    def known(self, x: Float[np.ndarray, " run"]) -> list[int]:
+        """Return the indices of the floors with a value."""
+        return [k for k in range(len(self.names)) if np.isfinite(x[self.floor == k]).any()]
 
     def over_all(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " estimate"]:
         """Return the mean over all runs, whatever their floor."""
@@ -158,15 +161,15 @@ class Jackknife:
         self,
         estimates: Float[np.ndarray, " estimate"],
         scale: Scale = "any",
-        floor: int | None = None,
+        floors: Sequence[int] | None = None,
     ) -> MeanInterval:
-        """Return the first estimate with its interval, of a quantity on one floor or on all.
+        """Return the first estimate with its interval, of a quantity on some floors or on all.
 
         The interval is missing if there are too few clusters, and for a share of exactly 0 or 1,
         which has no scatter from which its error could be estimated.
         """
         value = float(estimates[0])
-        mine = range(len(self.names)) if floor is None else [floor]
+        mine = list(range(len(self.names)) if floors is None else floors)
         count = np.array([(self.left_out == k).sum() for k in mine])
         change = (estimates[1:] - value) ** 2
         sums = np.array([change[self.left_out == k].sum() for k in mine])
@@ -208,13 +211,14 @@ def _summary(
     def mean(name: str, scale: Scale = "positive") -> MeanInterval | None:
         found = [getattr(run, name) for run in runs]
         x = np.array([np.nan if value is None else float(value) for value in found])
-        return by.interval(by.mean(x), scale) if np.isfinite(x).any() else None
+        known = by.known(x) if runs else []
+        return by.interval(by.mean(x), scale, known) if known else None
 
     error = np.array([run.endpoint_error for run in runs])
     behind, floors = None, None
     if runs:
         floors = {
-            name: by.interval(by.on(error, k), "positive", k) for k, name in enumerate(by.names)
+            name: by.interval(by.on(error, k), "positive", [k]) for k, name in enumerate(by.names)
         }
     if runs and rival:
         behind = by.interval(by.mean(error - np.array([run.endpoint_error for run in rival])))

@@ -10,8 +10,8 @@ from arviz_stats.base import array_stats
 
 from slipid.infer.posterior.blocks import LogDensity, Plan
 from slipid.infer.posterior.diagnosis import autocorrelation_time, diagnose
+from slipid.infer.posterior.ensemble import _begin, extended
 from slipid.infer.posterior.ensemble import chain as positions
-from slipid.infer.posterior.ensemble import extended
 from slipid.infer.posterior.proposals import DifferentialEvolution, families
 from slipid.support.progress import Reporter
 from tests.helpers.memory import holding
@@ -195,6 +195,10 @@ def test_an_interrupted_chain_continues_like_an_uninterrupted_one():
     target, _, _ = gaussian()
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2, 3), most=6, rows=200)
     whole = run(target, plan)
+    learnt = whole[0].learnt
+    assert learnt is not None
+    for state, places in zip(_begin(plan, whole[:1], learnt), learnt.places, strict=True):
+        np.testing.assert_array_equal(state.coords, places)  # none stays at the end of the block
     for stop in range(1, 6):
         again = run(target, plan, whole[:stop])
         for one, other in zip(again, whole, strict=True):
