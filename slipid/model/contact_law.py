@@ -20,11 +20,11 @@ Forces saturate with the ratio x of a speed to its onset as
     sat(x) = x sqrt(2 / (1 + x^2 + sqrt((1 - x^2)^2 + 4 h^2 x^2)))
 
 where the knee width h is a number of the floor; sat1 has h = `KNEE`, at which sat is nearest to
-tanh. sat(x)^2 is the non-rectangular hyperbola in x^2, the smaller root of a quadratic equation. It
-is x for small and 1 for large x, sat(1) = 1 / sqrt(1 + h); h = 0 would clip the force at x = 1. The
-function is smooth everywhere, and takes two square roots. At h = 2^(2/k) - 1 it is within 0.011 of
-the Rapp model x / (1 + |x|^k)^(1/k) for k from 1.6 to 7 and equals it for k = 2, but does not need
-powers, which take ten times as long.
+tanh. sat(x)^2 is the non-rectangular hyperbola in x^2: the root between 0 and 1 of the quadratic
+equation (1 - h^2) z^2 - (1 + x^2) z + x^2 = 0. sat(x) is x for small and 1 for large x, and sat(1)
+= 1 / sqrt(1 + h); h = 0 would clip the force at x = 1. The function is smooth everywhere, and takes
+two square roots. At h = 2^(2/k) - 1 it is within 0.011 of the Rapp model x / (1 + |x|^k)^(1/k) for
+k from 1.6 to 7 and equals it for k = 2, but does not need powers, which take ten times as long.
 
 These equations are for omni wheels. Where rollers stand at an angle g to the drive, vs_i is r w_i
 sin g less the speed along the direction in which the rollers do not roll, and r w_i cos g is
@@ -112,7 +112,7 @@ class ContactSurface(eqx.Module):
         "1", "p", "power of the load that drag grows with", start=1.15, spread=0.25
     )
     knee_width: Array = positive(
-        "1", "h", "width of the knee between creep and full sliding", start=KNEE, spread=0.7
+        "1", "h", "width of the knee between creep and full sliding", start=0.9, spread=0.4
     )
     load_bias: Array = parameter(
         "1",
