@@ -32,7 +32,7 @@ MOST_COMPONENTS = 64
 """Number of principal components of the residuals of a group; spare ones are zero."""
 LEAST_VARIANCE = 1e-4
 """Variance of a component below which it is left out."""
-MOST_WIDE = 8
+MOST_WIDE = 6
 """Largest number of inputs that have terms of up to the fourth degree."""
 UPPER_END = 2.0
 """Distance of log q above the mean of x [std]."""
