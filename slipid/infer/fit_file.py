@@ -34,7 +34,7 @@ from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
-SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/7"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/8"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
 _SHARED = ("std", "coefs", "by_number", "covariance")
@@ -305,7 +305,6 @@ def _robot_of(kept: Content) -> Robot:
     )
     names = kept["surfaces"], kept["loads"], kept["sessions"]
     robot = build(geometry, *names, centre=tuple(kept["centre"]))
-    # a parameter that is newer than the file has its start value
-    known = {e: kept["values"][e.path] for e in entries(robot) if e.path in kept["values"]}
+    known = {e: kept["values"][e.path] for e in entries(robot)}
     restored: Robot = with_values(robot, known)
     return restored

@@ -197,7 +197,7 @@ class BalanceAt:
         """Return the twist that balances the forces when each is replaced by its chord.
 
         A chord is the line through zero at zero speed and through the force at xi (Weiszfeld's
-        iteration). Since tanh(x) / x falls with |x|, chord steps do not overshoot as Newton's do;
+        iteration). Since sat(x) / x falls with |x|, chord steps do not overshoot as Newton's do;
         near the root they converge slowly.
         """
         on, f, w = self.on, self.on.frame, self.wheels

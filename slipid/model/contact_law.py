@@ -11,16 +11,27 @@ load share, v^ the direction of motion, and forces in units of mu m g:
     vs_i  = r w_i - J_i xi                             sliding speed
     N     = N0 - P b v^                                contact patches lead the wheel centres by b;
                                                        P: loads that keep sum N and sum N (p + b v^)
-    T_i   =  N_i [tanh(vs_i / (v0 + s0 c_i)) + kv vs_i - g_i crr tanh(J_i xi / (v0 + s1 c_i))]
-    D_i   = -N_i [g_i cr tanh(q_i / (vr + sr c_i)) + kl q_i]
-    0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0))
+    T_i   =  N_i [sat(vs_i / (v0 + s0 c_i)) + kv vs_i - g_i crr sat1(J_i xi / (v0 + s1 c_i))]
+    D_i   = -N_i [g_i cr sat(q_i / (vr + sr c_i)) + kl q_i]
+    0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz sat1(W / W0))
+
+Forces saturate with the ratio x of a speed to its onset as
+
+    sat(x) = x sqrt(2 / (1 + x^2 + sqrt((1 - x^2)^2 + 4 h^2 x^2)))
+
+where the knee width h is a number of the floor; sat1 has h = `KNEE`, at which sat is nearest to
+tanh. sat(x)^2 is the non-rectangular hyperbola in x^2: the root between 0 and 1 of the quadratic
+equation (1 - h^2) z^2 - (1 + x^2) z + x^2 = 0. sat(x) is x for small and 1 for large x, and sat(1)
+= 1 / sqrt(1 + h); h = 0 would clip the force at x = 1. The function is smooth everywhere, and takes
+two square roots. At h = 2^(2/k) - 1 it is within 0.011 of the Rapp model x / (1 + |x|^k)^(1/k) for
+k from 1.6 to 7 and equals it for k = 2, but does not need powers, which take ten times as long.
 
 These equations are for omni wheels. Where rollers stand at an angle g to the drive, vs_i is r w_i
 sin g less the speed along the direction in which the rollers do not roll, and r w_i cos g is
 subtracted from q_i. Ordinary wheels have the same friction sideways as ahead, and it acts against
 their total sliding: with m_i = sqrt(vs_i^2 + q_i^2) the first terms of T_i and D_i are
 
-    N_i tanh(m_i / (v0 + s0 c_i)) vs_i / m_i,     -N_i tanh(m_i / (v0 + s0 c_i)) q_i / m_i
+    N_i sat(m_i / (v0 + s0 c_i)) vs_i / m_i,     -N_i sat(m_i / (v0 + s0 c_i)) q_i / m_i
 
 They sink into soft floors: r w_i exp(rho) takes the place of r w_i, with rho = 0 on the firmest
 floor, while the lever of the torque stays r. Without rho the fit takes the smaller radius for slip
@@ -41,6 +52,7 @@ Every function here is elementwise: it takes arrays of any shapes that broadcast
 
 from dataclasses import replace
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -61,10 +73,10 @@ S1 = 0.2
 """Ratio of speed along the drive to wheel activity below which rolling resistance is viscous."""
 W0 = 0.05
 """Yaw rate below which the scrub moment is viscous [rad/s]."""
+KNEE = 0.65
+"""Knee width at which saturation is nearest to tanh: it differs by 0.021 at most."""
 
 
-_STILL = 1e-6
-"""Sliding speed added in quadrature, so that its magnitude is smooth at standstill [m/s]."""
 positive = partial(parameter, lower=0.0)
 """Declaration of a parameter above zero."""
 
@@ -98,6 +110,9 @@ class ContactSurface(eqx.Module):
     lead: Array = parameter("m", "b", "contact ahead of the wheel centre", start=0.002, spread=0.01)
     drag_exponent: Array = positive(
         "1", "p", "power of the load that drag grows with", start=1.15, spread=0.25
+    )
+    knee_width: Array = positive(
+        "1", "h", "width of the knee between creep and full sliding", start=0.9, spread=0.4
     )
     load_bias: Array = parameter(
         "1",
@@ -133,21 +148,48 @@ class ContactSurface(eqx.Module):
         return replace(jax.tree.map(lambda leaf: share @ leaf, self), load_bias=bias)
 
 
-class Friction(eqx.Module):
-    """A saturating force against a speed: top tanh(m / onset) speed / m + viscosity speed.
+class Saturation(NamedTuple):
+    """The function sat of the module docstring at a ratio x of speed to onset.
 
-    m is the magnitude of the speed, or of the total sliding of which this speed is one component:
-    friction acts against the total sliding.
+    Attributes:
+        chord: sat(x) / x, 1 at x = 0.
+        slope: derivative of sat(x).
+        bend: (chord - slope) / x^2, finite at x = 0.
+    """
+
+    chord: Array
+    slope: Array
+    bend: Array
+
+    @classmethod
+    def at(cls, square: Array, knee: Array | float) -> "Saturation":
+        """Return the saturation at x^2 = `square` with the knee width `knee`."""
+        width = 2 * knee**2
+        root = jnp.sqrt((1 - square) ** 2 + 2 * width * square)
+        total = 1 + square + root
+        chord = jnp.sqrt(2 / total)
+        per = chord / (total * root)
+        # neither sum cancels: where 1 - x^2 nearly equals -root or root, the last term is larger
+        slope = per * (root + (1 - square) + width * square)
+        return cls(chord, slope, per * (root - (1 - square) + width))
+
+
+class Friction(eqx.Module):
+    """A saturating force against a speed: top sat(m / onset) speed / m + viscosity speed.
+
+    m is the magnitude of the total sliding, of which `speed` and `beside` are components: friction
+    acts against the total sliding.
 
     Attributes:
         speed: sliding or rolling speed [m/s].
-        onset: speed at which the force reaches tanh(1) = 76 % of `top` [m/s]; it is linear in the
+        onset: speed at which linear and saturated force intersect [m/s]; it is linear in the
             wheel's activity.
         ratio: derivative of the onset with respect to the activity.
         top: saturated force.
         viscosity: force per speed.
-        beside: component of the sliding at right angles to `speed` [m/s]; None where friction in
-            one direction does not depend on sliding in the other.
+        beside: component of the sliding at right angles to `speed` [m/s]; 0 where friction in one
+            direction does not depend on sliding in the other.
+        knee: knee width of the saturation.
     """
 
     speed: Array
@@ -155,59 +197,42 @@ class Friction(eqx.Module):
     ratio: Array | float
     top: Array | float
     viscosity: Array | float = 0.0
-    beside: Array | None = None
+    beside: Array | float = 0.0
+    knee: Array | float = KNEE
 
     @cached_property
     def force(self) -> Array:
         """The force."""
-        if self.beside is None:
-            return self.top * jnp.tanh(self.speed / self.onset) + self.viscosity * self.speed
-        return (self.top * self._slope() + self.viscosity) * self.speed
+        return self.chord() * self.speed
 
     def chord(self) -> Array:
-        """Return force over speed, an even function of the speed that is finite at rest."""
-        if self.beside is None:
-            size = jnp.abs(self.speed) + 1e-12 * self.onset
-            return self.top * (jnp.tanh(size / self.onset) / size) + self.viscosity
-        return self.top * self._slope() + self.viscosity
+        """Return force over speed, an even function of the speed."""
+        return self._stiffness * self._saturation.chord + self.viscosity
 
     def by_speed(self) -> Array:
         """Return the derivative of the force with respect to the speed at a constant activity."""
-        if self.beside is None:
-            return self._top_slope() / self.onset + self.viscosity
-        return self.top * (self._slope() + self._slope_change() * self.speed**2) + self.viscosity
+        across = self._saturation.bend * (self.beside / self.onset) ** 2
+        return self._stiffness * (self._saturation.slope + across) + self.viscosity
 
-    def by_beside(self) -> Array | float:
+    def by_beside(self) -> Array:
         """Return the derivative of the force with respect to `beside`."""
-        if self.beside is None:
-            return 0.0
-        return self.top * self._slope_change() * self.speed * self.beside
+        bend = self._saturation.bend / self.onset**2
+        return -self._stiffness * bend * self.speed * self.beside
 
     def by_activity(self) -> Array:
         """Return the derivative of the force with respect to the activity at a constant speed."""
-        return -(self._top_slope() / self.onset) * (self.speed / self.onset) * self.ratio
+        part = self._stiffness * self._saturation.slope
+        return -part * (self.speed / self.onset) * self.ratio
 
-    def _top_slope(self) -> Array:
-        """Return top (1 - tanh^2(m / onset)), the slope of the saturating term times the onset."""
-        size = self._size()
-        if self.beside is None:
-            return self.top * (1 - jnp.tanh(size / self.onset) ** 2)
-        return self.top * (1 - (self._slope() * size) ** 2)
+    @cached_property
+    def _stiffness(self) -> Array:
+        """Slope of the saturating term at rest."""
+        return jnp.asarray(self.top / self.onset)
 
-    def _size(self) -> Array:
-        """Return the magnitude of sliding, kept away from zero where it has two components."""
-        if self.beside is None:
-            return self.speed
-        return jnp.sqrt(self.speed**2 + self.beside**2 + _STILL**2)
-
-    def _slope(self) -> Array:
-        """Return tanh(m / onset) / m."""
-        return jnp.tanh(self._size() / self.onset) / self._size()
-
-    def _slope_change(self) -> Array:
-        """Return the derivative of `_slope` with respect to m, divided by m."""
-        m, slope = self._size(), self._slope()
-        return ((1 - (slope * m) ** 2) / self.onset - slope) / m**2
+    @cached_property
+    def _saturation(self) -> Saturation:
+        square = (self.speed / self.onset) ** 2 + (self.beside / self.onset) ** 2
+        return Saturation.at(square, self.knee)
 
 
 class WheelForces(eqx.Module):
@@ -241,14 +266,14 @@ class WheelForces(eqx.Module):
 
 
 def wheel_traction(
-    slide: Array, active: Array, floor: ContactSurface, beside: Array | None = None
+    slide: Array, active: Array, floor: ContactSurface, beside: Array | float = 0.0
 ) -> Friction:
     """Return the traction at a sliding speed along the drive.
 
     `beside` is the sliding speed across, for wheels without rollers.
     """
     onset = V0 + floor.creep * active
-    return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity, beside)
+    return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity, beside, floor.knee_width)
 
 
 def rolling_fraction(rim: Array, roll: Array, drive_share: Array) -> Array:
@@ -321,13 +346,13 @@ def wheel_forces(
     """
     active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
     onset, slide = at_rest + floor.roller_creep * active, rim * drive_share - along
-    ahead, beside = (None, None) if grip is None else (grip * slide, grip * roll)
+    ahead, beside = (0.0, 0.0) if grip is None else (grip * slide, grip * roll)
     drag = floor.roller_creep, floor.roller_drag, floor.roller_viscosity
     return WheelForces(
         active=active,
         traction=wheel_traction(slide, active, floor, beside),
         resistance=Friction(along, V0 + S1 * active, S1, floor.rolling_resistance),
-        drag=Friction(roll, onset, *drag, ahead),
+        drag=Friction(roll, onset, *drag, ahead, floor.knee_width),
     )
 
 

@@ -24,12 +24,8 @@ from slipid.model.robot import build
 from slipid.parameter import Declaration, Entry, entries
 from slipid.robot.record import (
     UNITS,
-    ActuatorRecord,
     EffectRecord,
-    LimitsRecord,
-    LogSensors,
     Numbers,
-    RecordedNumber,
     RobotRecord,
     Setting,
 )
@@ -120,7 +116,7 @@ def _wrong(where: str, value: object, expected: str) -> ValueError:
     return ValueError(f"{where}: {shown}; expected {expected}")
 
 
-SCHEMA, BEFORE = "slipid.robot/8", "slipid.robot/7"
+SCHEMA = "slipid.robot/9"
 REWRITE_HINT = "copy it again, or write it again with `slipid identify`"
 
 
@@ -141,74 +137,23 @@ def read_robot(path: Path) -> RobotRecord:
     """Return the record in a robot's file; raise the same errors as `DeployedRobot.load`."""
     content = _content(path)
     written, computed = content.pop("checksum", None), checksum(content)
-    before = content.pop("schema") == BEFORE
-    units = content.pop("units", None)
-    if before and isinstance(units, dict):
-        units = {k: v for k, v in units.items() if not k.startswith("gains.")}
-    known = isinstance(units, dict) and units.items() <= UNITS.items() if before else units == UNITS
-    if not known:
+    del content["schema"]
+    if content.pop("units", None) != UNITS:
         raise DataError(
             f"{path}: the units in this file differ from the units of {SCHEMA}; {REWRITE_HINT}"
         )
     numbers = content.pop("numbers", None)
     try:
-        if before:
-            content = _with_assumed(content)
         record = typed(RobotRecord, content)
-        same = before or numbers == record.numbers
-        record = _with_newer(record)
         check_record(record)
     except ValueError as error:
         raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
-    if written != computed or not same:
+    if written != computed or numbers != record.numbers:
         raise DataError(
             f"{path}: the content does not match its checksum, so it was changed or damaged after "
             f"it was written; {REWRITE_HINT}"
         )
     return record
-
-
-def _with_newer(record: RobotRecord) -> RobotRecord:
-    """Return a record with the parameters that earlier versions lacked, at their start values.
-
-    These are the rolling radii of floors and the shape of the drop of the brushes.
-    """
-    newer = ("rolling_radius", "brush_current", "brush_shape", "brush_tail")
-    missing = {
-        e.path: RecordedNumber(e.declaration.start, e.declaration.unit)
-        for e in declared_numbers(record)
-        if e.quantity.endswith(newer) and e.path not in record.parameters
-    }
-    return replace(record, parameters={**record.parameters, **missing})
-
-
-def _with_assumed(content: Mapping[str, Any]) -> dict[str, object]:
-    """Return the content of a file of schema `BEFORE` as `SCHEMA` has it, with a message.
-
-    Limits, noise of sensors and actuators were not written; the values are those that every robot
-    had. Nominal and calibrated kinematics were not written either.
-    """
-    limits = LimitsRecord(Setting(0.5), Setting(2.0), Setting(1.0), Setting(13.0), Setting(22.0))
-    message = (
-        f"read from a file of {BEFORE}, which has no limits of the robot: speed 0.5 m/s, yaw rate "
-        "2 rad/s, acceleration 1 m/s^2, wheel speed 13 rad/s, voltage 22 V and the noise of its "
-        "sensors are assumed; write the file again with `slipid identify`"
-    )
-    found: dict[str, object] = {"nominal": None, **content}
-    # gains that earlier versions tuned in simulation are designed or set by hand now
-    found.pop("gains", None)
-    found |= {"limits": asdict(limits), "actuators": asdict(ActuatorRecord())}
-    if isinstance(messages := content.get("messages"), list):
-        found["messages"] = [*messages, message]
-    if isinstance(sensors := content.get("sensors"), dict):
-        found["sensors"] = asdict(LogSensors()) | sensors
-    if isinstance(floors := content.get("floors"), list):
-        empty = {"calibration": None}
-        found["floors"] = [empty | floor if isinstance(floor, dict) else floor for floor in floors]
-    if isinstance(loads := content.get("loads"), list):
-        none = {"inverse_kinematics": None}
-        found["loads"] = [none | load if isinstance(load, dict) else load for load in loads]
-    return found
 
 
 def _content(path: Path) -> dict[str, object]:
@@ -230,7 +175,7 @@ def _content(path: Path) -> dict[str, object]:
             f"{path}: not a robot of slipid (its schema is not {SCHEMA}); expected the robot.json "
             "that `slipid identify` writes"
         )
-    if schema not in (SCHEMA, BEFORE):
+    if schema != SCHEMA:
         newer = int(schema.partition("/")[2]) > int(SCHEMA.partition("/")[2])
         age, then = ("a newer", "update slipid") if newer else ("an older", REWRITE_HINT)
         raise DataError(

@@ -172,7 +172,7 @@ def rollouts(folder, robots, steps):
     under = on.floor
     rows = [under.friction, under.creep, under.roller_drag, under.roller_creep]
     rows += [under.rolling_resistance, under.slide_viscosity, under.roller_viscosity]
-    rows += [under.scrub[None], under.lead[None]]
+    rows += [under.knee_width, under.scrub[None], under.lead[None]]
     columns = np.concatenate([np.asarray(x) for x in rows]).T
     table = np.ascontiguousarray(np.hstack([np.tile(one, (robots, 1)), columns]))
     flat = np.ascontiguousarray(np.asarray(rims).transpose(0, 2, 1))

@@ -127,6 +127,7 @@ def settled(folder: Path) -> tuple[int, np.ndarray]:
         one = [f.frame.hold, f.frame.roll, f.frame.shift, on.rest[:, k], f.inverse, f.frame.base]
         per_wheel = (floor.friction, floor.creep, floor.roller_drag, floor.roller_creep)
         per_wheel += (floor.rolling_resistance, floor.slide_viscosity, floor.roller_viscosity)
+        per_wheel += (floor.knee_width,)
         one += [jnp.broadcast_to(x, (f.wheels, count))[:, k] for x in per_wheel]
         one += [jnp.broadcast_to(x, count)[k] for x in (floor.scrub, floor.lead)]
         rows.append(np.concatenate([np.asarray(x).ravel() for x in one]))

@@ -2,16 +2,25 @@
    after the other, the same arithmetic in the same order of steps. Doubles in, doubles out; see bench_control.py. */
 #include <math.h>
 #define W 3
-static const double V0 = 0.002, VR = 0.001, S1 = 0.2, W0 = 0.05;
+static const double V0 = 0.002, VR = 0.001, S1 = 0.2, W0 = 0.05, KNEE = 0.65;
 typedef struct {
   double hold[W][3], roll[W][3], shift[W][2], rest[W], plain[3][W], base;
   double held[W], creep[W], drag[W], roller_creep[W], resistance[W], viscosity[W], roller_viscosity[W];
-  double scrub, lead;
+  double knee[W], scrub, lead;
 } Floor;
 
-static double slope(double x, double scale) {
-  double size = fabs(x) + 1e-12 * scale;
-  return tanh(size / scale) / size;
+/* sat(x) / x, and in *rise the derivative of sat, at x = speed / scale */
+static double saturation(double speed, double scale, double knee, double *rise) {
+  double square = (speed / scale) * (speed / scale), width = 2 * knee * knee;
+  double root = sqrt((1 - square) * (1 - square) + 2 * width * square), total = 1 + square + root;
+  double chord = sqrt(2 / total);
+  *rise = chord / (total * root) * (root + (1 - square) + width * square);
+  return chord;
+}
+
+static double slope(double speed, double scale, double knee) {
+  double rise;
+  return saturation(speed, scale, knee, &rise) / scale;
 }
 
 static void solve3(double m[3][3], const double b[3], double out[3]) {
@@ -35,15 +44,15 @@ static void chord(double xi[3], const double *rim, const Floor *f) {
     double active = sqrt(rim[i] * rim[i] + roll * roll + 1e-12);
     double load = f->rest[i] - f->lead * (f->shift[i][0] * xi[0] + f->shift[i][1] * xi[1]) * inv;
     load = (load < 1e-3 ? 1e-3 : load) * f->held[i];
-    double pulls = load * (slope(rim[i] - along, V0 + f->creep[i] * active) + f->viscosity[i]);
-    double holds = load * (f->drag[i] * slope(roll, VR + f->roller_creep[i] * active) + f->roller_viscosity[i]);
-    double both = pulls + load * f->resistance[i] * slope(along, V0 + S1 * active);
+    double pulls = load * (slope(rim[i] - along, V0 + f->creep[i] * active, f->knee[i]) + f->viscosity[i]);
+    double holds = load * (f->drag[i] * slope(roll, VR + f->roller_creep[i] * active, f->knee[i]) + f->roller_viscosity[i]);
+    double both = pulls + load * f->resistance[i] * slope(along, V0 + S1 * active, KNEE);
     for (int a = 0; a < 3; a++) {
       for (int b = 0; b < 3; b++) m[a][b] += h[a] * h[b] * both + k[a] * k[b] * holds;
       drive[a] += h[a] * pulls * rim[i];
     }
   }
-  m[2][2] += f->scrub * slope(xi[2], W0);
+  m[2][2] += f->scrub * slope(xi[2], W0, KNEE);
   solve3(m, drive, xi);
 }
 
@@ -61,13 +70,16 @@ static double balance(const double xi[3], const double *rim, const Floor *f, dou
     double st = V0 + f->creep[i] * active, sr = VR + f->roller_creep[i] * active, s1 = V0 + S1 * active;
     double ahead = f->shift[i][0] * xi[0] + f->shift[i][1] * xi[1];
     double load = (f->rest[i] - f->lead * ahead * inv) * f->held[i];
-    double t = tanh(slide / st), g = tanh(roll / sr), u = tanh(along / s1);
+    double t1, g1, u1;
+    double t = slide / st * saturation(slide, st, f->knee[i], &t1);
+    double g = roll / sr * saturation(roll, sr, f->knee[i], &g1);
+    double u = along / s1 * saturation(along, s1, KNEE, &u1);
     double grip = t + f->viscosity[i] * slide, traction = grip - f->resistance[i] * u;
     double drag = -(f->drag[i] * g + f->roller_viscosity[i] * roll);
-    double d = roll / active, brake = f->resistance[i] * (1 - u * u) / s1, t1 = 1 - t * t;
+    double d = roll / active, brake = f->resistance[i] * u1 / s1;
     double by = load * (-t1 / st - f->viscosity[i] - brake);
     double across = load * (brake * along * S1 / s1 - t1 * slide * f->creep[i] / (st * st)) * d;
-    double rolls = -load * (f->drag[i] * (1 - g * g) * (1 / sr - roll * f->roller_creep[i] * d / (sr * sr)) + f->roller_viscosity[i]);
+    double rolls = -load * (f->drag[i] * g1 * (1 / sr - roll * f->roller_creep[i] * d / (sr * sr)) + f->roller_viscosity[i]);
     for (int a = 0; a < 3; a++) force[a] += load * (h[a] * traction + k[a] * drag);
     for (int b = 0; b < 3; b++) {
       double pull = by * h[b] + across * k[b], push = rolls * k[b];
@@ -80,9 +92,9 @@ static double balance(const double xi[3], const double *rim, const Floor *f, dou
     }
     felt[i] = load * grip;
   }
-  double turn = tanh(xi[2] / W0);
+  double rise, turn = xi[2] / W0 * saturation(xi[2], W0, KNEE, &rise);
   force[2] -= f->scrub * turn;
-  m[2][2] -= f->scrub * (1 - turn * turn) / W0;
+  m[2][2] -= f->scrub * rise / W0;
   double yaw = force[2] / f->base;
   return force[0] * force[0] + force[1] * force[1] + yaw * yaw;
 }

@@ -81,7 +81,9 @@ class Rival:
         traction, _, load, *_ = terms(xi, rim, hold, roll, pull, shift, s, rest)
         along, active = xi @ hold.T, np.sqrt(rim**2 + (xi @ roll.T) ** 2 + 1e-12)
         sets_in = contact_law.V0 + contact_law.S1 * active
-        driven = traction + s["rolling_resistance"] * np.tanh(along / sets_in)
+        driven = (
+            traction + s["rolling_resistance"] * saturated(along / sets_in, contact_law.KNEE)[0]
+        )
         weight = s["friction"] * v["body", "mass"] * 9.81
         m = {k[1]: x for k, x in v.items() if k[0] == "motor"}
         turns = rim * pull / active
@@ -135,6 +137,14 @@ def advance(xi, dt):
     return np.stack([(a * xi[:, 0] - b * xi[:, 1]) * dt, (b * xi[:, 0] + a * xi[:, 1]) * dt, w], 1)
 
 
+def saturated(x, knee):
+    """The root y of (1 - h^2) y^4 - (1 + x^2) y^2 + x^2 = 0, its slope, and y / x."""
+    a, b = 1 - knee**2, 1 + x * x
+    chord = np.sqrt(2 / (b + np.sqrt(b * b - 4 * a * x * x)))
+    y = x * chord
+    return y, (1 - y * y) / (chord * (b - 2 * a * y * y)), chord
+
+
 def terms(xi, rim, hold, roll, pull, shift, s, rest):
     v = xi[:, :2]
     inv = 1 / np.sqrt((v * v).sum(1, keepdims=True) + 1e-8)
@@ -149,11 +159,12 @@ def terms(xi, rim, hold, roll, pull, shift, s, rest):
     scale_t = contact_law.V0 + s["creep"] * active
     scale_r = contact_law.VR + s["roller_creep"] * active
     sets_in = contact_law.V0 + contact_law.S1 * active
-    t, h, u = np.tanh(slide / scale_t), np.tanh(side / scale_r), np.tanh(along / sets_in)
+    t, t1, _ = saturated(slide / scale_t, s["knee_width"])
+    h, h1, _ = saturated(side / scale_r, s["knee_width"])
+    u, u1, _ = saturated(along / sets_in, contact_law.KNEE)
     traction = t + s["slide_viscosity"] * slide - s["rolling_resistance"] * u
     drag = -(s["roller_drag"] * h + s["roller_viscosity"] * side)
-    t1, h1 = 1 - t * t, 1 - h * h
-    brake = s["rolling_resistance"] * (1 - u * u) / sets_in
+    brake = s["rolling_resistance"] * u1 / sets_in
     a = -t1 / scale_t - s["slide_viscosity"] - brake
     b = -t1 * slide * s["creep"] * side / active / scale_t**2
     b = b + brake * along * contact_law.S1 * side / active / sets_in
@@ -179,7 +190,7 @@ def equilibrium(rim, hold, roll, pull, shift, s, rest, base, near=None):
     def force(xi):
         traction, drag, load, *more = terms(xi, rim, hold, roll, pull, shift, s, rest)
         f = (load * traction) @ hold + (load * drag) @ roll
-        f[:, 2] -= s["scrub"][:, 0] * np.tanh(xi[:, 2] / contact_law.W0)
+        f[:, 2] -= s["scrub"][:, 0] * saturated(xi[:, 2] / contact_law.W0, contact_law.KNEE)[0]
         return f * rows, traction, drag, load, *more
 
     def chord(xi):
@@ -189,15 +200,14 @@ def equilibrium(rim, hold, roll, pull, shift, s, rest, base, near=None):
         along, side = xi @ hold.T, xi @ roll.T
         active = np.sqrt(rim**2 + side**2 + 1e-12)
 
-        def slope(x, scale):
-            flat = np.abs(x) < 1e-6 * scale
-            return np.where(flat, 1 / scale, np.tanh(x / scale) / np.where(flat, 1.0, x))
+        def slope(x, scale, knee=contact_law.KNEE):
+            return saturated(x / scale, knee)[2] / scale
 
-        pulls = (
-            slope(rim * pull - along, contact_law.V0 + s["creep"] * active) + s["slide_viscosity"]
-        )
-        holds = s["roller_drag"] * slope(side, contact_law.VR + s["roller_creep"] * active)
-        holds = load * (holds + s["roller_viscosity"])
+        knee = s["knee_width"]
+        grips = slope(rim * pull - along, contact_law.V0 + s["creep"] * active, knee)
+        pulls = grips + s["slide_viscosity"]
+        holds = slope(side, contact_law.VR + s["roller_creep"] * active, knee)
+        holds = load * (s["roller_drag"] * holds + s["roller_viscosity"])
         brakes = (
             load * s["rolling_resistance"] * slope(along, contact_law.V0 + contact_law.S1 * active)
         )
@@ -212,8 +222,8 @@ def equilibrium(rim, hold, roll, pull, shift, s, rest, base, near=None):
         d_t[..., :2] += traction[..., None] * d_load
         d_d[..., :2] += drag[..., None] * d_load
         jac = hold.T @ d_t + roll.T @ d_d
-        turn = np.tanh(xi[:, 2] / contact_law.W0)
-        jac[:, 2, 2] -= s["scrub"][:, 0] * (1 - turn**2) / contact_law.W0
+        _, rise, _ = saturated(xi[:, 2] / contact_law.W0, contact_law.KNEE)
+        jac[:, 2, 2] -= s["scrub"][:, 0] * rise / contact_law.W0
         return solve3(rows[:, None] * jac, f), f
 
     def newton(xi):

@@ -16,10 +16,11 @@ import pytest
 from slipid.model import contact
 from slipid.model import contact_law as law
 from slipid.model.contact_balance import Balance, stand
-from slipid.model.contact_law import S1, V0, W0, ContactSurface
+from slipid.model.contact_law import KNEE, S1, V0, W0, ContactSurface
 from slipid.model.geometry import mecanum, omni, skid_steer
 from slipid.model.se2 import Planar
 from slipid.parameter import entries
+from tests.helpers.numpy_model import saturated
 
 ROBOTINO = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
 OMNI4 = omni([45.0, 135.0, 225.0, 315.0], 0.2, 0.05)
@@ -91,6 +92,7 @@ def cases(kind, count, geometry=ROBOTINO, seed=0):
         drag_exponent=jnp.asarray(rng.uniform(1.0, 1.6, count)),
         load_bias=jnp.asarray(bias - bias.mean(axis=1, keepdims=True)),
         rolling_radius=jnp.asarray(rng.uniform(-0.1, 0.0, count)),
+        knee_width=jnp.asarray(np.exp(rng.uniform(math.log(0.2), math.log(2.0), count))),
     )
     fast = np.abs(rim).max(axis=1) > 1.5
     rim[fast] *= 1.5 / np.abs(rim[fast]).max(axis=1, keepdims=True)
@@ -426,7 +428,7 @@ def test_drag_grows_with_a_power_of_the_load():
 
 @pytest.mark.parametrize("power", [1.0, 1.15, 1.6])
 def test_drag_of_a_wheel_goes_with_that_power_of_its_load(power):
-    """N g tanh with g = (w N)^(p - 1): from one load to another as the ratio to the power p."""
+    """N g sat with g = (w N)^(p - 1): from one load to another as the ratio to the power p."""
     floor = surface(roller_drag=0.3, roller_viscosity=1e-300, lead=0.0, drag_exponent=power)
     frame, xi = ROBOTINO.frame(), jnp.array([0.2, 0.05, 0.3])
     rim = jnp.array([0.15, -0.02, -0.1])
@@ -481,10 +483,11 @@ def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
         np.asarray(floors.rolling_resistance)[:, None]
         * even ** (np.asarray(floors.drag_exponent)[:, None] - 1)
         * np.asarray(found.load)
-        * np.tanh(along / (V0 + S1 * active))
+        * saturated(along / (V0 + S1 * active), KNEE)[0]
         * along
     )
-    scrub = np.asarray(floors.scrub) * np.tanh(np.asarray(xi)[:, 2] / W0) * xi[:, 2]
+    turned = saturated(np.asarray(xi)[:, 2] / W0, KNEE)[0]
+    scrub = np.asarray(floors.scrub) * turned * xi[:, 2]
     for loss in (sliding, rollers, rolling):
         assert (loss[solved] >= -1e-15).all()
     assert (scrub >= 0).all()
@@ -501,6 +504,99 @@ def test_no_wheel_pushes_harder_than_friction_allows():
     xi = solve(rim, frame, floors, rest)
     felt = forces(xi, rim, frame, floors, rest)
     assert (np.abs(felt.traction) <= np.abs(felt.load) * (1 + 1e-12)).all()
+
+
+# saturation
+
+KNEES = jnp.array([1e-3, 0.2, KNEE, 1.0, 1.0 + 1e-9, 3.0, 100.0])
+
+
+def sat(x, knee):
+    return x * law.Saturation.at(x * x, knee).chord
+
+
+@pytest.fixture(scope="module")
+def saturations():
+    """For each knee width and x: slope and bend, and derivatives of x chord up to the second."""
+    x = jnp.concatenate([jnp.array([0.0, 1.0]), jnp.logspace(-12, 6, 100)])
+
+    def derivatives(x, knee):
+        first = jax.grad(sat, (0, 1))(x, knee)
+        return sat(x, knee), first, jax.hessian(sat, (0, 1))(x, knee)
+
+    def of_all(knee):
+        found = law.Saturation.at(x * x, knee)
+        return found, jax.vmap(derivatives, (0, None))(x, knee)
+
+    return np.asarray(x), *jax.tree.map(np.asarray, jax.jit(jax.vmap(of_all))(KNEES))
+
+
+def test_saturation_is_the_root_of_its_quadratic_equation(saturations):
+    """(1 - h^2) y^4 - (1 + x^2) y^2 + x^2 = 0 with y = sat(x), and y rises from 0 to 1."""
+    x, _, (y, _, _) = saturations
+    a = 1 - np.asarray(KNEES)[:, None] ** 2
+    size = np.abs(a) * y**4 + (1 + x**2) * y**2 + x**2
+    assert (np.abs(a * y**4 - (1 + x**2) * y**2 + x**2) <= 1e-14 * size).all()
+    # the larger of both roots is above 1
+    assert (y <= 1 + 1e-15).all()
+    assert (np.diff(y[:, 2:]) >= -1e-15).all()
+    np.testing.assert_allclose(y[:, 1], 1 / np.sqrt(1 + KNEES), rtol=1e-14)
+
+
+def test_slopes_and_bends_are_derivatives_of_the_saturation(saturations):
+    x, found, (_, (by_x, _), _) = saturations
+    np.testing.assert_allclose(found.slope, by_x, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(found.chord - found.bend * x**2, by_x, rtol=1e-9, atol=1e-15)
+    np.testing.assert_array_equal(found.slope[:, 0], 1.0)
+
+
+def test_saturation_is_smooth_in_the_speed_and_in_the_knee(saturations):
+    """At rest it is x - h^2 x^3 / 2: its second derivatives are 0 there, and finite everywhere."""
+    _, _, (_, (_, by_knee), second) = saturations
+    for each in (by_knee, *(part for row in second for part in row)):
+        assert np.isfinite(each).all()
+        np.testing.assert_array_equal(each[:, 0], 0.0)
+    third = jax.vmap(jax.grad(jax.grad(jax.grad(sat))), (None, 0))(0.0, KNEES)
+    np.testing.assert_allclose(third, -3 * KNEES**2, rtol=1e-12, atol=1e-15)
+
+
+def test_a_wider_knee_saturates_later():
+    widths, x = jnp.linspace(0.1, 3.0, 30), jnp.asarray(2.0)
+    assert (np.diff(jax.vmap(lambda h: sat(x, h))(widths)) < 0).all()
+
+
+def test_the_usual_knee_is_nearest_to_the_hyperbolic_tangent():
+    x, widths = jnp.linspace(0.0, 6.0, 1000), jnp.linspace(0.5, 0.8, 31)
+    worst = jnp.abs(jax.vmap(lambda h: sat(x, h))(widths) - jnp.tanh(x)).max(axis=1)
+    assert float(widths[worst.argmin()]) == pytest.approx(KNEE, abs=0.011)
+    assert float(worst.min()) < 0.022
+
+
+def test_friction_in_two_directions_has_the_derivatives_of_its_force():
+    """Speeds down to 0; in the direction of the speed, beside it and in the activity."""
+    rng = np.random.default_rng(0)
+    speeds = jnp.asarray(np.concatenate([np.zeros((1, 2)), rng.normal(0, 0.1, (200, 2))]))
+
+    def made(v, active):
+        return law.Friction(v[0], 0.002 + 0.3 * active, 0.3, 0.7, 0.2, v[1], 0.9)
+
+    def both(v):
+        at, active = made(v, 0.1), jnp.asarray(0.1)
+        exact = jax.grad(lambda v, active: made(v, active).force, (0, 1))(v, active)
+        return jnp.stack([at.by_speed(), at.by_beside(), at.by_activity()]), jnp.append(*exact)
+
+    ours, exact = jax.jit(jax.vmap(both))(speeds)
+    np.testing.assert_allclose(ours, exact, rtol=1e-9, atol=1e-12)
+
+
+def test_each_floor_has_its_own_knee():
+    """It shapes traction and roller drag, where speeds are near their onsets."""
+    frame, rim = ROBOTINO.frame(), jnp.array([0.1, 0.03, -0.12])
+    sharp, broad = (replace(FLOORS["gray"], knee_width=jnp.asarray(h)) for h in (0.2, 1.5))
+    xi = jnp.array([0.05, 0.02, 0.1])
+    one, other = (forces_of(xi, rim, frame, floor, EVEN) for floor in (sharp, broad))
+    for name in ("traction", "drag"):
+        assert (np.abs(getattr(one, name)) > 1.02 * np.abs(getattr(other, name))).any()
 
 
 # several floors

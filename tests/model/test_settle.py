@@ -36,6 +36,7 @@ FLOORS = ContactSurface(
     lead=jnp.array([0.002, 0.004]),
     drag_exponent=jnp.array([1.1, 1.5]),
     rolling_radius=jnp.array([0.0, -0.03]),
+    knee_width=jnp.array([0.5, 1.0]),
     labels=("a", "b"),
 )
 

@@ -51,10 +51,11 @@ def robot() -> DeployedRobot:
             r.body.load_share,
             r.surfaces.friction,
             r.surfaces.drag_exponent,
+            r.surfaces.knee_width,
             r.surfaces.load_bias,
         ),
         made,
-        (share, friction, jnp.asarray([1.0, 1.6]), biases),
+        (share, friction, jnp.asarray([1.0, 1.6]), jnp.asarray([0.3, 1.1]), biases),
     )
     several = jax.tree.map(lambda x: jnp.broadcast_to(x, (5, *x.shape)), made)
     noise = np.random.default_rng(0).normal(size=(5, 2))
@@ -101,6 +102,7 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     assert float(again.floors.friction[1]) == 0.1 + 0.2
     np.testing.assert_array_equal(again.floors.load_bias, [[0.1, -0.3, 0.2], [0.0, 1 / 3, -1 / 3]])
     np.testing.assert_array_equal(again.floors.drag_exponent, [1.0, 1.6])
+    np.testing.assert_array_equal(again.floors.knee_width, [0.3, 1.1])
     np.testing.assert_array_equal(again.effect_table.table[..., :3], TOLD.mean)
     np.testing.assert_array_equal(first.effect_table.table, [[[[0, 0, 0, 1, 1, 1]]]] * 2)
     text = path.read_bytes()
@@ -210,73 +212,18 @@ def test_what_is_no_robot_is_refused(tmp_path):
 
 
 def test_a_newer_file_asks_for_an_update(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/9", more=3))
+    rewritten(path, lambda c: c.update(schema="slipid.robot/10", more=3))
     said = refused(path)
-    assert "written by a newer slipid as slipid.robot/9" in said
+    assert "written by a newer slipid as slipid.robot/10" in said
     assert "update slipid" in said
 
 
 def test_an_older_file_whose_law_was_another_is_to_be_written_anew(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/2"))
+    """Forces saturated as tanh, which is no shape of a knee."""
+    rewritten(path, lambda c: c.update(schema="slipid.robot/8"))
     said = refused(path)
-    assert "written by an older slipid as slipid.robot/2" in said
+    assert "written by an older slipid as slipid.robot/8" in said
     assert "write it again with `slipid identify`" in said
-
-
-def as_schema_7(content: dict) -> None:
-    """Change the content of a file into what the version before wrote."""
-    added = ("limits.", "sensors.", "actuators.", "loads.inverse_kinematics", "nominal")
-    added += ("floors.calibration",)
-    units = {k: v for k, v in content["units"].items() if not k.startswith(added)}
-    sensors = {k: v for k, v in content["sensors"].items() if isinstance(v, bool)}
-    units["gains.loss"], gains = "mm", {"values": {"yaw": {"value": 1.0}}, "load": "own"}
-    content.update(schema="slipid.robot/7", units=units, sensors=sensors, gains=gains)
-    del content["limits"], content["actuators"], content["nominal"]
-    for floor in content["floors"]:
-        del floor["calibration"]
-    for load in content["loads"]:
-        del load["inverse_kinematics"]
-
-
-def test_a_file_of_the_version_before_loads_and_says_what_is_assumed(path, robot):
-    rewritten(path, as_schema_7)
-    old = DeployedRobot.load(path, "moved")
-    assert old.record.parameters == robot.record.parameters
-    assert old.record.sensors == robot.record.sensors
-    assert [load.inverse_kinematics for load in old.record.loads] == [None, None]
-    assert Limits.of(old) == Limits()
-    assert old.record.limits.voltage == Setting(22.0, "assumed")
-    assert "slipid.robot/7, which has no limits of the robot: speed 0.5" in old.record.messages[-1]
-    old.save(path)
-    assert DeployedRobot.load(path, "moved").record == old.record
-    rewritten(path, as_schema_7)
-    path.write_text(path.read_text().replace("0.003", "0.004", 1))
-    assert "does not match its checksum" in refused(path)
-
-
-def test_a_file_without_rolling_radii_has_those_of_the_wheels(path, robot):
-    def as_before(content):
-        for name in robot.labels:
-            assert content["parameters"].pop(f"surface.{name}.rolling_radius")
-
-    rewritten(path, as_before)
-    again = DeployedRobot.load(path, "moved")
-    same(again, robot)
-    np.testing.assert_array_equal(again.floors.rolling_radius, [0.0, 0.0])
-
-
-def test_a_file_without_a_shape_of_the_brush_drop_has_that_of_its_time(path, robot):
-    """It was U_b tanh(I / 0.05 A)."""
-
-    def as_before(content):
-        for name in ("current", "shape", "tail"):
-            assert content["parameters"].pop(f"motor.brush_{name}")
-        content["parameters"]["motor.brush_drop"]["value"] = 0.7
-
-    rewritten(path, as_before)
-    motor, amps = DeployedRobot.load(path, "moved").motor, jnp.asarray([-0.3, 0.02, 0.1])
-    drop = motor.voltage(amps, jnp.zeros(3)) - motor.resistance * amps
-    np.testing.assert_allclose(drop, 0.7 * jnp.tanh(amps / 0.05), rtol=1e-12)
 
 
 def test_limits_without_logs_follow_from_the_robots_own_wheels():
@@ -409,7 +356,7 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c["draws"].update(mass=[1]), "'mass' is not a parameter"),
         (
             lambda c: c["units"].update(alike="m"),
-            "the units in this file differ from the units of slipid.robot/8",
+            "the units in this file differ from the units of slipid.robot/9",
         ),
         (
             lambda c: c.update(loads=c["loads"][:1] * 2),

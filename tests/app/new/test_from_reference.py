@@ -57,7 +57,7 @@ def test_start_values_are_those_of_the_reference():
     assert (prior.mean, prior.std) == (5.95, 0.3)
     assert content.parameters["motor.back_emf"].prior.mean == pytest.approx(0.0514, abs=0.001)
     text = new_config(template_draft(ask({"robot": "robotino"}, None)), "m.toml").text
-    assert "0.32 on gray" in text
+    assert "0.46 on gray" in text
     assert "# Nominal sizes of the reference robot robotino: FESTO" in text
 
 
