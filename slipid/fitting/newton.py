@@ -34,7 +34,7 @@ def newton_step(
 
     The step is -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), with r the residuals, J their
     Jacobian, W the weighted inverse noise covariance, S the prior stds, and g the gradient of
-    log |d residuals / d data|. Currents and voltages change the electric parameters only; where there
+    log |d residuals / d data|. Currents and voltages change the electric parameters only; if there
     are runs over several floors, these follow the others (`electric_following`).
 
     Args:
