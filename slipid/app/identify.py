@@ -351,7 +351,8 @@ def _with_mixed_runs(
     alone = {name: e.speed for name, e in result.as_if.items()}
     end = result.optimum
     moved = largest_shift(fit.space, fit.z, fit.covariance, end.state.z, end.converged)
-    sentence = contradiction(floors, moved, result.learnt.speed, alone)
+    held_out = result.after and result.after.speed / max(result.before.speed, 1e-9)
+    sentence = contradiction(floors, moved, result.learnt.speed, alone, held_out)
     if sentence is None:
         return replace(new, mixed=about)
     report.line(sentence)

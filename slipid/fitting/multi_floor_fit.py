@@ -21,7 +21,7 @@ from slipid.fitting.multi_floor import (
 from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
 
-_ROUNDS = 6
+_ROUNDS = 10
 """Largest number of rounds of a fit to half of the runs; such a fit only serves to judge errors."""
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from slipid.fitting.problem import FitState, Problem, log_jacobian
 from slipid.fitting.shared_effects import EffectPosterior, marginal_residuals, marginal_slopes
-from slipid.fitting.variances import MOTION_BLOCKS, Blocks
+from slipid.fitting.variances import MOTION_BLOCKS, Blocks, electric_following
 
 
 class NewtonStep(NamedTuple):
@@ -34,7 +34,8 @@ def newton_step(
 
     The step is -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), with r the residuals, J their
     Jacobian, W the weighted inverse noise covariance, S the prior stds, and g the gradient of
-    log |d residuals / d data|. Currents and voltages change the electric parameters only.
+    log |d residuals / d data|. Currents and voltages change the electric parameters only; if there
+    are runs over several floors, these follow the others (`electric_following`).
 
     Args:
         problem: the problem.
@@ -47,7 +48,8 @@ def newton_step(
     residual, jacobian = linear
     weighed = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
     roots = weighed.whitening.root
-    own = problem.space.electric.astype(float)
+    follow = electric_following(problem.objective, jacobian, roots, jnp.asarray(log_v))
+    own = np.diag(problem.space.electric.astype(float)) - np.asarray(follow)
     prior = np.asarray(problem.objective.prior_std(log_v)) ** -2
     _, slope = log_jacobian(problem.objective, z, electric, keep)
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
@@ -57,7 +59,8 @@ def newton_step(
         half = jnp.einsum("nij,njp->nip", root, jacobian[k])
         if k == "motion":
             white, half = _without_effects(weighed.effects, white, half)
-        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTION_BLOCKS else own)
+        flat = np.asarray(half).reshape(-1, len(z))
+        flat = flat if k in MOTION_BLOCKS else flat @ own
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         information = information + flat.T @ flat
     return NewtonStep(-np.linalg.solve(information, gradient), information)

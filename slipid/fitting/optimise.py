@@ -33,6 +33,7 @@ from slipid.fitting.variances import (
     Search,
     Square,
     Vector,
+    electric_following,
     fitted_covariance,
     scoring_step,
 )
@@ -100,7 +101,10 @@ def optimise(
     while state.round < most_rounds:
         early = state.round < 3
         scoring = (2 if early else 4) if variances else 0
-        state = one_round(problem, state, keep, mask, steps=8 if early else 4, scoring=scoring)
+        steps = 8 if early else 4
+        if problem.multi_floor is not None:
+            steps = 1  # the electric parameters follow the motion to first order only
+        state = one_round(problem, state, keep, mask, steps=steps, scoring=scoring)
         history.append(state.loss)
         tell(state)
         if state.moved < tolerance:
@@ -143,6 +147,7 @@ def one_round(
         electric=electric,
         motor_force=start.motor_force,
         slope=log_jacobian(objective, state.z, electric, keep)[1],
+        following=electric_following(objective, start.jacobian, root, log_v),
     )
     y, near = levenberg(partial(linearised, fixed), len(state.z), start.twists, steps)
     z = np.asarray(_at(fixed, y))
@@ -175,7 +180,12 @@ def one_round(
         weight, motion = weighed.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
         axes = axis_effects(objective, motion, weight, covariance, np.asarray(log_v))
         found = effect_variances(axes, np.asarray(log_v))
-        found[objective.pooled] = pooled(information, z, objective, np.asarray(log_v))
+        spread_of_loads = pooled(information, z, objective, np.asarray(log_v))
+        if problem.multi_floor is not None:
+            # With one step in a round, the loads follow their variance late: full changes of both
+            # could oscillate for ever, so the variance changes by half of it.
+            spread_of_loads = 0.5 * (spread_of_loads + state.log_variance[objective.pooled])
+        found[objective.pooled] = spread_of_loads
         log_v = jnp.asarray(found)
     std = np.sqrt(np.diag(covariance))
     moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
@@ -299,6 +309,7 @@ class RoundInputs(eqx.Module):
         electric: noise that predictions of voltages depend on.
         motor_force: motor forces at z [mu m g], from which currents and voltages are predicted.
         slope: derivative of log |d residuals / d data| with respect to the search vector.
+        following: how electric parameters follow the others, see `electric_following`.
     """
 
     objective: Objective
@@ -310,6 +321,7 @@ class RoundInputs(eqx.Module):
     electric: lk.ElectricNoise
     motor_force: lk.MotorForce
     slope: Float[Array, " free"]
+    following: Float[Array, "free free"]
 
 
 class LinearisedResiduals(NamedTuple):
@@ -384,7 +396,7 @@ def linearised(fixed: RoundInputs, y: Search, near: Twists) -> LinearisedResidua
     `near` holds the twists of all windows after a similar step.
     """
     z = _at(fixed, y)
-    given = GivenMotion(np.array(True), fixed.z, fixed.motor_force)
+    given = GivenMotion(np.array(True), fixed.z, fixed.motor_force, fixed.following)
     found = linear_given(fixed.objective, z, fixed.electric, given, near)
     rows, slopes = _stacked(fixed, found.residual, found.jacobian, z)
     return LinearisedResiduals(np.asarray(rows), np.asarray(slopes), found.twists)

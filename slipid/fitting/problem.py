@@ -323,11 +323,15 @@ class GivenMotion(eqx.Module):
             False if they depend on all parameters at once.
         z: search vector from which the other parameters are taken.
         motor_force: motor forces at z [mu m g].
+        following: how electric parameters follow the others (free, free), see
+            `electric_following`. Only what they do not follow changes electric residuals. It is
+            used if there are runs over several floors.
     """
 
     applies: Bool[np.ndarray, ""]
     z: Vector
     motor_force: lk.MotorForce | Float[np.ndarray, "segment window drive 2"]
+    following: Array | Float[np.ndarray, "free free"]
 
 
 class Twists(NamedTuple):
@@ -377,7 +381,8 @@ def linear(
     `near` holds the twists at a search vector close to z, which make the root finder faster.
     """
     no_force = np.zeros((*objective.batch.turn.shape, 2))
-    given = GivenMotion(np.array(False), np.zeros(len(z)), no_force)
+    none = np.zeros((len(z), len(z)))
+    given = GivenMotion(np.array(False), np.zeros(len(z)), no_force, none)
     return linear_given(objective, z, electric, given, near or Twists.unknown(objective))
 
 
@@ -394,7 +399,10 @@ def linear_given(
 
     def blocks(x: Array) -> tuple[Blocks, ResidualsAt]:
         robot = space.tree(x)
-        electrical = space.tree(jnp.where(given.applies & ~space.electric, given.z, x))
+        own = x
+        if objective.multi_floor is not None:
+            own -= jnp.where(given.applies, given.following @ (x - given.z), 0.0)
+        electrical = space.tree(jnp.where(given.applies & ~space.electric, given.z, own))
         p = lk.predict(robot, batch, near.steady)
         force = jax.lax.cond(
             given.applies,

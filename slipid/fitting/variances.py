@@ -170,16 +170,18 @@ def precision(
     Shared effects are marginalised; if `alone`, every run is treated as if it shared no effects.
     """
     prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
-    total, of_motion = prior, prior
+    motion, electric = jnp.zeros_like(prior), jnp.zeros_like(prior)
     for k, half in whitened(objective.blocks, jacobian, log_v, keep).items():
         flat = half.reshape(-1, half.shape[-1])
         if k == "motion" and not alone:
             flat = marginal_slopes(expected_posteriors(objective, log_v, keep), half)
-        total += flat.T @ flat
-        of_motion += flat.T @ flat if k in MOTION_BLOCKS else 0.0
+        if k in MOTION_BLOCKS:
+            motion += flat.T @ flat
+        else:
+            electric += flat.T @ flat
     if objective.joint:
-        return total
-    return _cut(total, of_motion, jnp.asarray(objective.space.electric))
+        return prior + motion + electric
+    return _cut(motion, electric, prior, jnp.asarray(objective.space.electric))
 
 
 def expected_posteriors(objective: Objective, log_v: Vector, keep: Vector) -> Posteriors:
@@ -198,28 +200,66 @@ def expected(m: Array | float | int) -> Any:
     return (DEGREES + m) / (DEGREES + m + 2)
 
 
-def _cut(total: Array, of_motion: Array, e: Array) -> Array:
-    """Return the information of p(motion | motion data) p(electric | motion, all data).
+def _cut(motion: Array, electric: Array, prior: Array, e: Array) -> Array:
+    """Return the information of p(motion data | all) p(electric | others, electric data).
 
-    If wheels stand on several floors, motion depends on their friction, which is one of the
-    electric parameters `e`. The first factor marginalises friction as if currents contained no
-    information about it, although the estimated motion does use the friction from currents. The
-    intervals of the motion parameters are therefore somewhat too wide there.
+    The second factor is the conditional distribution of the electric parameters `e` given currents,
+    voltages and all other parameters. It contains their prior, and is a prior of the friction that
+    moves a robot whose wheels stand on several floors. Without such runs, the others have the
+    distribution that motion alone gives them.
+
+    Args:
+        motion: information of the motion residuals (free, free).
+        electric: information of currents and voltages (free, free).
+        prior: information of the prior, diagonal (free, free).
+        e: True for electric parameters (free,).
     """
-    first = of_motion - _schur_term(of_motion, e)
-    motion = ~e[:, None] & ~e[None, :]
-    return jnp.where(motion, first + _schur_term(total, e), total)
+    own = jnp.where(e[:, None] & e[None, :], electric + prior, 0.0)
+    apart = jnp.diag(jnp.where(e, 1.0, 0.0)) - following(electric, prior, e)
+    return motion + jnp.where(~e[:, None] & ~e[None, :], prior, 0.0) + apart.T @ own @ apart
 
 
-def _schur_term(information: Array, e: Array) -> Array:
-    """Return the matrix B^T A^-1 B of an information matrix.
+def following(electric: Array, prior: Array, e: Array) -> Array:
+    """Return how electric parameters follow the others, given currents and voltages (free, free).
 
-    Its block A has the rows and columns of the coordinates `e`; its block B has the rows of these
-    coordinates and the columns of all others.
+    They are most likely to change by this matrix times a small change of the other parameters: for
+    the information A of the electric parameters and the part B between these and the others, it is
+    -A^-1 B. Arguments as in `_cut`.
     """
-    own = jnp.where(e[:, None] & e[None, :], information, jnp.diag(jnp.where(e, 0.0, 1.0)))
-    cross = jnp.where(e[:, None] & ~e[None, :], information, 0.0)
-    return cross.T @ jnp.linalg.solve(own, cross)
+    own = jnp.where(e[:, None] & e[None, :], electric + prior, jnp.diag(jnp.where(e, 0.0, 1.0)))
+    cross = jnp.where(e[:, None] & ~e[None, :], electric, 0.0)
+    return -jnp.linalg.solve(own, cross)
+
+
+@eqx.filter_jit
+def electric_following(
+    objective: Objective, jacobian: Blocks, root: Blocks, log_v: Vector
+) -> Array:
+    """Return how electric parameters follow those of the motion in a fit (free, free).
+
+    Currents are predicted from the motion at the start of a round. Without this change, a step of
+    the motion would contradict the currents by an amount that the next round finds again, and
+    parameters could drift from round to round. It matters only to runs over several floors, whose
+    motion depends on friction; without them it is zero.
+
+    Args:
+        objective: the objective of the fit.
+        jacobian: derivatives of the residuals (segment, m, free), keyed by block.
+        root: whitening roots of the residuals, keyed by block.
+        log_v: log variances.
+    """
+    space = objective.space
+    none = jnp.zeros((space.size, space.size))
+    if objective.multi_floor is None or objective.joint:
+        return none
+    halves = [
+        jnp.einsum("nij,njp->nip", root[k], slopes).reshape(-1, space.size)
+        for k, slopes in jacobian.items()
+        if k not in MOTION_BLOCKS
+    ]
+    electric = sum((half.T @ half for half in halves), none)
+    prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
+    return following(electric, prior, jnp.asarray(space.electric))
 
 
 @eqx.filter_jit

@@ -51,7 +51,14 @@ A wrong map makes the error several times larger.
 """
 LARGEST_SHIFT = 4.0
 """Largest accepted shift of a parameter, in its standard errors, when runs over several floors are
-added to the runs on one floor each."""
+added to the runs on one floor each, unless held-out runs confirm it (`CONFIRMED_RATIO`)."""
+CONFIRMED_RATIO = 0.8
+"""Ratio of the error of runs over several floors that a fit to the other half of them predicts, to
+the error without such runs, below which these runs confirm what the fit has learnt.
+
+Runs on one floor each can leave several laws possible, whose parameters are many standard errors
+apart. Runs over several floors then decide between these laws.
+"""
 ONE_FLOOR_RATIO = 0.8
 """Ratio of the error as if all wheels were on one floor to the error with the map, below which the
 map is rejected."""
@@ -143,6 +150,7 @@ def contradiction(
     shift: tuple[str, float],
     by_map: float,
     as_if: Mapping[str, float],
+    held_out: float | None,
 ) -> str | None:
     """Return the reason to reject runs over several floors, None if they agree with all other runs.
 
@@ -152,7 +160,10 @@ def contradiction(
         by_map: error of the runs over several floors [m/s], with the wheels' floors from the map.
         as_if: error of the same runs as if all wheels always stood on one floor, keyed by that
             floor [m/s].
+        held_out: error of each half of these runs, predicted by a fit that learnt from the other
+            half, divided by that of the fit without such runs; None if there is only one run.
     """
+    confirmed = held_out is not None and held_out < CONFIRMED_RATIO
     worse = ", ".join(
         f"{floor} grow from {100 * e.before:.1f} to {100 * e.after:.1f} % of the displacement"
         for floor, e in found.items()
@@ -164,7 +175,7 @@ def contradiction(
         reason = f"end-point errors on {worse}"
     elif not np.isfinite(sigma):
         reason = "the fit to all runs did not converge"
-    elif sigma > LARGEST_SHIFT:
+    elif sigma > LARGEST_SHIFT and not confirmed:
         reason = f"{name} changes by {sigma:.0f} standard errors"
     elif as_if[best] < ONE_FLOOR_RATIO * by_map:
         errors = f"{1000 * by_map:.1f} mm/s with their map, but {1000 * as_if[best]:.1f} mm/s"

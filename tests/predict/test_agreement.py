@@ -58,6 +58,7 @@ def test_floors_that_are_worse_are_named_and_no_others():
         STILL,
         0.02,
         {"gray": 0.03, "green": 0.03},
+        0.5,
     )
     assert "gray grow from 1.3 to 7.0 % of the displacement" in reason
     assert "green" not in reason
@@ -66,7 +67,7 @@ def test_floors_that_are_worse_are_named_and_no_others():
 
 @pytest.mark.parametrize(("green", "refused"), [(0.017, False), (0.015, True)])
 def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green, refused):
-    reason = contradiction(FINE, STILL, 0.02, {"gray": 0.05, "green": green})
+    reason = contradiction(FINE, STILL, 0.02, {"gray": 0.05, "green": green}, 0.5)
     assert (reason is not None) == refused
     if refused:
         assert "20.0 mm/s with their map, but 15.0 mm/s as if all wheels were on green" in reason
@@ -74,11 +75,20 @@ def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green
 
 
 @pytest.mark.parametrize(
-    ("sigma", "reason"),
-    [(3.9, None), (25.0, "changes by 25 standard errors"), (np.inf, "did not converge")],
+    ("sigma", "held_out", "reason"),
+    [
+        (3.9, 1.1, None),
+        (3.9, None, None),
+        (25.0, 0.9, "changes by 25 standard errors"),
+        (25.0, None, "changes by 25 standard errors"),
+        (25.0, 0.7, None),  # held-out runs confirm it
+        (np.inf, 0.7, "did not converge"),
+    ],
 )
-def test_numbers_that_move_far_are_a_contradiction(sigma, reason):
-    found = contradiction(FINE, ("robot.load_share", sigma), 0.02, {"gray": 0.05})
+def test_numbers_that_move_far_are_a_contradiction_unless_held_out_runs_confirm_it(
+    sigma, held_out, reason
+):
+    found = contradiction(FINE, ("robot.load_share", sigma), 0.02, {"gray": 0.05}, held_out)
     assert found is None if reason is None else reason in found
 
 
