@@ -3,9 +3,10 @@
     SLIPID_FIT=out/2022 .venv/bin/python -m pytest -s -o python_files='bench_*.py' \\
         tests/benchmarks/bench_variances.py
 
-The sampler keeps the variances of the fit. With variances that are drawn, the covariance of the
-parameters would be E[cov | v] + Cov(mean | v) (Kass and Steffey 1989, Journal of the American
-Statistical Association 84(407)); both are computed here with the fitted weights of runs.
+The chain has the variances of the fit. With variances that are drawn, the covariance of the
+parameters is E[cov | v] + Cov(mean | v) (Kass and Steffey 1989, Journal of the American Statistical
+Association 84(407)), of which `slipid sample` adds the excess to its draws; here it stands beside
+the covariance at the fit.
 """
 
 from __future__ import annotations
@@ -21,10 +22,15 @@ from slipid.app.config import read_config
 from slipid.app.logs import log_folder
 from slipid.app.problem import read_fit_task
 from slipid.infer.fit_file import load
-from slipid.infer.posterior.coordinates import Fitted, effects_at
-from slipid.infer.posterior.variance_draws import drawn_variances, floor_information, floor_runs
+from slipid.infer.posterior.coordinates import Fitted
+from slipid.infer.posterior.variance_draws import (
+    conditional,
+    drawn_variances,
+    floor_runs,
+    weights_at,
+)
 from slipid.infer.posterior.variance_draws import sweeps as sweeps_of
-from slipid.infer.posterior.variance_likelihood import SegmentNoise, linear_parts
+from slipid.infer.posterior.variance_likelihood import linear_parts
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick
 
@@ -48,11 +54,7 @@ def test_variance_draws(fit_folder):
     draws = drawn_variances(problem, fitted, SHAPE, 0)
     took, cpu = time.perf_counter() - began, time.process_time() - cpu
     print(f"\n{SHAPE} draws of {draws.shape[-1]} variances: {took:.0f} s, {cpu:.0f} s of a core")
-    residual, _ = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
-    effect = effects_at(problem, residual, fitted.log_variance)
-    weight = problem.weighed(
-        residual, fitted.log_variance, np.ones(len(problem.windows)), effect
-    ).whitening.weight
+    weight = weights_at(problem, fitted)
     some = draws.reshape(-1, draws.shape[-1])
     some = some[np.linspace(0, len(some) - 1, USED).astype(int)]
     for part in linear_parts(problem, fitted):
@@ -79,21 +81,7 @@ def test_variance_draws(fit_folder):
 def wider(part, weight, fitted, draws):
     """Return the ratio of the parameters' stds over draws of variances to those at the fit."""
     floors = floor_runs(part)
-
-    def moments(log_v):
-        precision, pull = part.precision.copy(), part.pull.copy()
-        inverse = {
-            k: np.linalg.inv(SegmentNoise.of(noise, part.degrees).covariance(log_v[None]))[:, 0]
-            * np.asarray(weight[k])[:, None, None]
-            for k, noise in part.noises.items()
-        }
-        rows = part.rows_at(log_v)
-        for floor in floors:
-            rows_of = floor_information(floor, rows, inverse, log_v).rows
-            precision[np.ix_(floor.columns, floor.columns)] += rows_of[:-1, :-1]
-            pull[floor.columns] -= rows_of[:-1, -1]
-        covariance = np.linalg.inv(precision)
-        return covariance @ pull, np.diag(covariance)
-
-    mean, variance = (np.array(x) for x in zip(*(moments(v) for v in draws), strict=True))
-    return np.sqrt((variance.mean(axis=0) + mean.var(axis=0)) / moments(fitted)[1])
+    found = [conditional(part, floors, weight, v) for v in draws]
+    mean = np.array([x.mean for x in found])
+    variance = np.mean([np.diag(x.covariance) for x in found], axis=0) + mean.var(axis=0)
+    return np.sqrt(variance / np.diag(conditional(part, floors, weight, fitted).covariance))

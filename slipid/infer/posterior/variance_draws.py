@@ -34,8 +34,8 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from slipid.fitting.hierarchy import pooled_stds
 from slipid.fitting.problem import Problem
-from slipid.fitting.variances import VARIANCE_SPREAD, Search, Variances, information
-from slipid.infer.posterior.coordinates import Fitted
+from slipid.fitting.variances import VARIANCE_SPREAD, Search, Square, Variances, information
+from slipid.infer.posterior.coordinates import Fitted, effects_at
 from slipid.infer.posterior.moves import Chains, hamiltonian, sliced
 from slipid.infer.posterior.variance_likelihood import (
     LinearPart,
@@ -62,6 +62,8 @@ _PATH, _MOST_LEAPS = (1.0, 4.0), 16
 the largest number of leapfrog steps of a move."""
 _STEP = 2.0
 """Width of a step outwards in the log variance of a shared effect."""
+_CONDITIONED = 120
+"""Number of draws of the variances given which covariances are computed."""
 _LEAST_EIGENVALUE = 1e-9
 """Part of the largest eigenvalue of the kernel over driving conditions below which others are 0."""
 
@@ -87,6 +89,73 @@ def drawn_variances(
     pooled = pooled_stds(np.linalg.inv(fitted.covariance), fitted.z, problem.objective, log_v)
     out[..., problem.objective.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
     return out
+
+
+def added_covariance(
+    problem: Problem, fitted: Fitted, draws: Float[np.ndarray, "ensemble draw variance"]
+) -> Square:
+    """Return the covariance that uncertain variances add to that of the parameters of the motion.
+
+    With variances v that are drawn, the covariance is E[cov | v] + Cov(mean | v); the covariance at
+    the fitted variances is subtracted. Negative eigenvalues of the difference are set to zero.
+    Source: Kass and Steffey 1989, Journal of the American Statistical Association 84(407).
+    """
+    part = linear_parts(problem, fitted)[0]
+    some = draws.reshape(-1, draws.shape[-1])
+    some = some[np.linspace(0, len(some) - 1, _CONDITIONED).astype(int)]
+    floors, at = floor_runs(part), weights_at(problem, fitted)
+    before = conditional(part, floors, at, fitted.log_variance).covariance
+    found = [conditional(part, floors, at, log_v) for log_v in some]
+    over = np.mean([x.covariance for x in found], axis=0) + np.cov(
+        [x.mean for x in found], rowvar=False
+    )
+    mine = ~problem.space.electric if not problem.objective.joint else np.ones(len(over), bool)
+    value, vector = np.linalg.eigh((over - before) * np.outer(mine, mine))
+    return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T)
+
+
+def weights_at(problem: Problem, fitted: Fitted) -> dict[str, np.ndarray]:
+    """Return the weight of every segment at a fit, keyed by block."""
+    residual, _ = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
+    effect = effects_at(problem, residual, fitted.log_variance)
+    weighed = problem.weighed(residual, fitted.log_variance, problem.full_weight, effect)
+    return {k: np.asarray(weight) for k, weight in weighed.whitening.weight.items()}
+
+
+class Conditional(NamedTuple):
+    """Distribution of the change of the search vector, given variances and weights of segments."""
+
+    mean: Search
+    covariance: Square
+
+
+def conditional(
+    part: LinearPart,
+    floors: Sequence["FloorRuns"],
+    weight: dict[str, np.ndarray],
+    log_v: Variances,
+) -> Conditional:
+    """Return the distribution of the change of the search vector, shared effects integrated out.
+
+    Args:
+        part: residuals that are linear in the search vector.
+        floors: runs of each floor, from `floor_runs`.
+        weight: weight of every segment, keyed by block.
+        log_v: log variances.
+    """
+    precision, pull = part.precision.copy(), part.pull.copy()
+    inverse = {
+        k: np.linalg.inv(SegmentNoise.of(noise, part.degrees).covariance(log_v[None]))[:, 0]
+        * weight[k][:, None, None]
+        for k, noise in part.noises.items()
+    }
+    whole = part.rows_at(log_v)
+    for floor in floors:
+        rows = floor_information(floor, whole, inverse, log_v).rows
+        precision[np.ix_(floor.columns, floor.columns)] += rows[:-1, :-1]
+        pull[floor.columns] -= rows[:-1, -1]
+    covariance = np.linalg.inv(precision)
+    return Conditional(covariance @ pull, covariance)
 
 
 class Sweep(NamedTuple):

@@ -14,10 +14,12 @@ from slipid.fitting.shared_effects import SharedEffects
 from slipid.fitting.variances import VARIANCE_SPREAD
 from slipid.infer.posterior.coordinates import Fitted
 from slipid.infer.posterior.variance_draws import (
+    added_covariance,
     drawn_variances,
     floor_information,
     floor_runs,
     sweeps,
+    weights_at,
 )
 from slipid.infer.posterior.variance_likelihood import (
     LinearPart,
@@ -183,6 +185,41 @@ def test_the_restricted_likelihood_is_that_of_the_covariance_of_all_residuals(pr
             log_det += 2 * np.log(np.diag(own.factor)).sum()
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
         assert log_det == pytest.approx(np.linalg.slogdet(whole)[1], rel=1e-6)
+
+
+def dense_estimate(problem, part, weight, log_v):
+    """Estimate of the change of the search vector and its covariance, from dense matrices."""
+    rows = part.rows["motion"]
+    n, m, columns = rows.shape
+    whole = dense.of_shared(problem, log_v)
+    scale = np.asarray(problem.covariance("motion", log_v)) / weight[:, None, None]
+    for k, v in enumerate(scale):
+        whole[k * m : (k + 1) * m, k * m : (k + 1) * m] += v
+    flat = rows.reshape(n * m, columns)
+    information = flat.T @ np.linalg.solve(whole, flat)
+    covariance = np.linalg.inv(part.precision + information[:-1, :-1])
+    return covariance @ (part.pull - information[:-1, -1]), covariance
+
+
+def test_uncertain_variances_add_to_the_covariance_of_the_motion(problem, fitted):
+    """Two sizes of the noise that are equally likely, against dense matrices."""
+    part = linear_parts(problem, fitted)[0]
+    larger = fitted.log_variance + np.log(4.0)
+    draws = np.stack([np.tile(fitted.log_variance, (200, 1)), np.tile(larger, (200, 1))])
+    weight, motion = weights_at(problem, fitted)["motion"], ~problem.space.electric
+    (first, before), (second, wide) = (
+        dense_estimate(problem, part, weight, v) for v in (fitted.log_variance, larger)
+    )
+    between = np.outer(second - first, second - first) / 4 * 120 / 119  # of 120 draws
+    expected = (0.5 * (wide - before) + between)[np.ix_(motion, motion)]
+    assert np.linalg.eigvalsh(expected).min() > 0
+    found = added_covariance(problem, fitted, draws)
+    np.testing.assert_allclose(
+        found[np.ix_(motion, motion)], expected, rtol=1e-5, atol=1e-8 * expected.max()
+    )
+    assert not found[~motion].any()  # electric parameters are drawn given the motion
+    none = added_covariance(problem, fitted, draws[:1])
+    assert np.abs(none).max() < 1e-9 * before.max()
 
 
 def test_the_likelihood_of_a_segment_is_a_student_density_and_has_its_slope(problem, fitted):
