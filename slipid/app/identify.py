@@ -291,7 +291,7 @@ def summarised(
     report.stage("intervals and verdicts", usual_s=COMPILING_S)
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
-        fit = _with_mixed_runs(fit, task, problem, optimum, report)
+        fit, problem, optimum = _with_mixed_runs(fit, task, problem, optimum, report)
     fit = with_chain(fit, task.settings, report)
     report.stage("predicting held-out runs")
     contact = contact_errors(task.dataset, problem, optimum, report.steps)
@@ -322,8 +322,8 @@ def with_chain(fit: Fit, settings: FitSection, report: Reporter) -> Fit:
 
 def _with_mixed_runs(
     fit: Fit, task: FitTask, problem: Problem, optimum: Optimum, report: Reporter
-) -> Fit:
-    """Return the fit to all runs, those over several floors included.
+) -> tuple[Fit, Problem, Optimum]:
+    """Return the fit to all runs, those over several floors included, its problem and optimum.
 
     If the runs over several floors contradict the given fit, which is of runs on one floor each,
     the given fit is returned, with the reason.
@@ -350,13 +350,12 @@ def _with_mixed_runs(
     report.line(_mixed_sentence(about))
     alone = {name: e.speed for name, e in result.as_if.items()}
     end = result.optimum
-    moved = largest_shift(fit.space, fit.z, fit.covariance, end.state.z, end.converged)
-    held_out = result.after and result.after.speed / max(result.before.speed, 1e-9)
-    sentence = contradiction(floors, moved, result.learnt.speed, alone, held_out)
+    moved = largest_shift(fit.space, fit.z, fit.covariance, end.state.z, new.converged)
+    sentence = contradiction(floors, moved, result.learnt.speed, alone, result.gain)
     if sentence is None:
-        return replace(new, mixed=about)
+        return replace(new, mixed=about), result.problem, end
     report.line(sentence)
-    return replace(fit, refused={**about, "reason": sentence})
+    return replace(fit, refused={**about, "reason": sentence}), problem, optimum
 
 
 def _mixed_sentence(about: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from slipid.fitting.multi_floor import (
     MultiFloorBatch,
@@ -21,8 +21,10 @@ from slipid.fitting.multi_floor import (
 from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
 
-_ROUNDS = 10
-"""Largest number of rounds of a fit to half of the runs; such a fit only serves to judge errors."""
+_TOLERANCE = 0.1
+"""Tolerance of `optimise` for a fit to half of the runs, which only serves to judge errors."""
+_SAME_DIRECTION = np.radians(15.0)
+"""Width of the sectors of direction whose runs are held out together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,7 @@ class MultiFloorFit:
         after: errors on the runs over several floors, each half of which is predicted by a fit to
             the other half; None if there is only one run.
         learnt: errors on the runs over several floors, predicted by the fit to all runs.
+        settled: True if both fits to half of the runs converged.
         as_if: errors, keyed by floor, if `learnt` is predicted as if all wheels always stood on
             that floor; they exceed those of `learnt` if the map is correct.
     """
@@ -45,7 +48,23 @@ class MultiFloorFit:
     before: WindowErrors
     after: WindowErrors | None
     learnt: WindowErrors
+    settled: bool
     as_if: Mapping[str, WindowErrors]
+
+    @property
+    def gain(self) -> float | None:
+        """Largest ratio of held-out errors with the other half of the runs to those without.
+
+        It is that of the speed or of the yaw rate. None if it is not known, or if the currents,
+        which know of the map as well, are predicted worse.
+        """
+        before, after = self.before, self.after
+        if after is None or not self.settled:
+            return None
+        if after.current is not None and after.current > (before.current or 0.0):
+            return None
+        pairs = (after.speed, before.speed), (after.yaw_rate, before.yaw_rate)
+        return max(new / max(old, 1e-12) for new, old in pairs)
 
 
 def fit_multi_floor(
@@ -63,7 +82,7 @@ def fit_multi_floor(
     """
     whole = problem.with_multi_floor(multi_floor)
     start = replace(whole.carried_over(optimum.state, problem), round=0)
-    odd = np.unique(multi_floor.windows.run, return_inverse=True)[1] % 2 == 1
+    odd = _every_second_sector(multi_floor)
     objective, every = whole.objective, np.ones(len(odd))
     batch = objective.multi_floor
     assert batch is not None, "`with_multi_floor` sets the batch of runs over several floors"
@@ -76,12 +95,15 @@ def fit_multi_floor(
         return window_errors(of, found)
 
     learnt = optimise(whole, start=start, tell=tell, most_rounds=most_rounds, tolerance=tolerance)
-    after = None
+    after, settled = None, False
     if odd.any() and not odd.all():
-        parts = []
+        parts, settled = [], True
         for half in (odd, ~odd):
             keep = np.concatenate([np.ones(len(problem.windows)), ~half])
-            other = optimise(whole, keep=keep, start=start, most_rounds=_ROUNDS)
+            other = optimise(
+                whole, keep=keep, start=start, most_rounds=most_rounds, tolerance=_TOLERANCE
+            )
+            settled &= other.converged
             parts.append((other.state, half.astype(float)))
         after = errors(batch, *parts)
     end = (learnt.state, every)
@@ -91,8 +113,24 @@ def fit_multi_floor(
         before=errors(batch, (start, every)),
         after=after,
         learnt=errors(batch, end),
+        settled=settled,
         as_if={
             floor: errors(batch.as_if_on(k), end)
             for k, floor in enumerate(whole.robot.surfaces.labels)
         },
     )
+
+
+def _every_second_sector(runs: MultiFloorRuns) -> Bool[np.ndarray, " segment"]:
+    """Return True for segments of every second group of runs in similar directions.
+
+    Runs that repeat each other are in the same half. All runs of a sector of direction, from the
+    first to the last pose, are a group; if there is one group only, every run is one.
+    """
+    w = runs.windows
+    names, first, of_run = np.unique(w.run, return_index=True, return_inverse=True)
+    last = len(w.run) - 1 - np.unique(w.run[::-1], return_index=True)[1]
+    x, y = (w.pose[last, -1, :2] - w.pose[first, 0, :2]).T
+    group = np.unique(np.round(np.arctan2(y, x) / _SAME_DIRECTION), return_inverse=True)[1]
+    group = group if group.any() else np.arange(len(names))
+    return np.asarray(group[of_run] % 2 == 1)

@@ -34,8 +34,9 @@ def newton_step(
 
     The step is -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), with r the residuals, J their
     Jacobian, W the weighted inverse noise covariance, S the prior stds, and g the gradient of
-    log |d residuals / d data|. Currents and voltages change the electric parameters only; if there
-    are runs over several floors, these follow the others (`electric_following`).
+    log |d residuals / d data|. Currents and voltages change the electric parameters only. If there
+    are runs over several floors, these follow the others (`electric_following`): z - mean and the
+    residuals of currents are those of z less what has followed.
 
     Args:
         problem: the problem.
@@ -48,19 +49,20 @@ def newton_step(
     residual, jacobian = linear
     weighed = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
     roots = weighed.whitening.root
-    follow = electric_following(problem.objective, jacobian, roots, jnp.asarray(log_v))
-    own = np.diag(problem.space.electric.astype(float)) - np.asarray(follow)
+    following = electric_following(problem.objective, jacobian, roots, jnp.asarray(log_v))
+    own = np.eye(len(z)) - np.asarray(following)
+    of_electric = own * problem.space.electric[:, None]
     prior = np.asarray(problem.objective.prior_std(log_v)) ** -2
     _, slope = log_jacobian(problem.objective, z, electric, keep)
-    gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
-    information = np.diag(prior)
+    gradient = own.T @ (prior * (z - problem.space.prior_mean) - np.asarray(slope))
+    information = own.T @ (prior[:, None] * own)
     for k, root in roots.items():
         white = jnp.einsum("nij,nj->ni", root, residual[k])
         half = jnp.einsum("nij,njp->nip", root, jacobian[k])
         if k == "motion":
             white, half = _without_effects(weighed.effects, white, half)
         flat = np.asarray(half).reshape(-1, len(z))
-        flat = flat if k in MOTION_BLOCKS else flat @ own
+        flat = flat if k in MOTION_BLOCKS else flat @ of_electric
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         information = information + flat.T @ flat
     return NewtonStep(-np.linalg.solve(information, gradient), information)

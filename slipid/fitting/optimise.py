@@ -147,7 +147,7 @@ def one_round(
         electric=electric,
         motor_force=start.motor_force,
         slope=log_jacobian(objective, state.z, electric, keep)[1],
-        following=electric_following(objective, start.jacobian, root, log_v),
+        following=electric_following(objective, start.jacobian, root, log_v) * mask[:, None],
     )
     y, near = levenberg(partial(linearised, fixed), len(state.z), start.twists, steps)
     z = np.asarray(_at(fixed, y))
@@ -417,7 +417,9 @@ def _stacked(
     # the log Jacobian adds slope . z to the log posterior: to first order it shifts the prior mean
     mean = fixed.objective.space.prior_mean + fixed.prior_std**2 * fixed.slope
     slopes = jax.vmap(rows, -1, -1)(jacobian) * scale
+    own = z - fixed.following @ (z - fixed.z)
+    of_prior = (jnp.eye(len(scale)) - fixed.following) * scale / fixed.prior_std[:, None]
     return (
-        jnp.concatenate([rows(residual), (z - mean) / fixed.prior_std]),
-        jnp.concatenate([slopes, jnp.diag(fixed.mask)]),
+        jnp.concatenate([rows(residual), (own - mean) / fixed.prior_std]),
+        jnp.concatenate([slopes, of_prior]),
     )

@@ -239,8 +239,9 @@ def electric_following(
 
     Currents are predicted from the motion at the start of a round. Without this change, a step of
     the motion would contradict the currents by an amount that the next round finds again, and
-    parameters could drift from round to round. It matters only to runs over several floors, whose
-    motion depends on friction; without them it is zero.
+    parameters could drift from round to round. Residuals of currents and the prior of the electric
+    parameters are those of the parameters less what followed. It matters only to runs over several
+    floors, whose motion depends on friction; without them it is zero.
 
     Args:
         objective: the objective of the fit.

@@ -161,7 +161,7 @@ def contradiction(
         as_if: error of the same runs as if all wheels always stood on one floor, keyed by that
             floor [m/s].
         held_out: error of each half of these runs, predicted by a fit that learnt from the other
-            half, divided by that of the fit without such runs; None if there is only one run.
+            half, divided by that of the fit without such runs; None if it is not known.
     """
     confirmed = held_out is not None and held_out < CONFIRMED_RATIO
     worse = ", ".join(

@@ -25,7 +25,8 @@ from slipid.deploy.deploy import read_robot
 from slipid.fitting import likelihood as lk
 from slipid.fitting import multi_floor as cut
 from slipid.fitting.multi_floor_fit import fit_multi_floor
-from slipid.fitting.optimise import optimise
+from slipid.fitting.newton import newton_step
+from slipid.fitting.optimise import one_round, optimise
 from slipid.fitting.problem import Problem
 from slipid.fitting.variances import _cut, whitened
 from slipid.infer.fit_file import load
@@ -177,6 +178,32 @@ def test_a_contradiction_of_motion_and_currents_does_not_drift_from_round_to_rou
     assert (
         np.diff(found.history).max() < 0.1
     )  # the loss never rises, but by what noise is rounded to
+
+
+@pytest.mark.slow
+def test_held_out_runs_over_several_floors_change_no_step_of_the_motion(fitted):
+    """Neither do currents or the prior of friction, without motion over several floors."""
+    true, problem, optimum = fitted
+    state = replace(optimum.state, z=problem.space.vector(true))
+    whole = problem.with_multi_floor(crossed(true, 6, 5))
+    joint = whole.carried_over(state, problem)
+    alone = np.ones(len(problem.windows))
+    keep = np.concatenate([alone, np.zeros(6)])
+    motion = ~problem.space.electric
+    stds = []
+    for p, at, used in ((problem, state, alone), (whole, joint, keep)):
+        linear = p.linear(at.z, p.electric(at.z, at.log_variance))
+        found = newton_step(p, at, linear, used)
+        stds.append((found.step[motion], np.linalg.inv(found.information)[np.ix_(motion, motion)]))
+    np.testing.assert_allclose(stds[1][0], stds[0][0], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(stds[1][1], stds[0][1], rtol=1e-6, atol=1e-12)
+    mask = np.ones(problem.space.size)
+    one, other = (
+        one_round(p, at, used, mask, steps=1, scoring=0)
+        for p, at, used in ((problem, state, alone), (whole, joint, keep))
+    )
+    moved = np.abs(one.z - state.z)[motion].max()  # but for the solver's damping
+    np.testing.assert_allclose(other.z[motion], one.z[motion], atol=0.01 * moved)
 
 
 @pytest.mark.slow
