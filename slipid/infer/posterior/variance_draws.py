@@ -23,7 +23,7 @@ infinity if other variances can explain the residuals.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, pairwise
 from typing import NamedTuple
@@ -34,7 +34,14 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from slipid.fitting.hierarchy import pooled_stds
 from slipid.fitting.problem import Problem
-from slipid.fitting.variances import VARIANCE_SPREAD, Search, Square, Variances, information
+from slipid.fitting.variances import (
+    VARIANCE_SPREAD,
+    Search,
+    Square,
+    Variances,
+    expected,
+    information,
+)
 from slipid.infer.posterior.coordinates import Fitted, effects_at
 from slipid.infer.posterior.moves import Chains, hamiltonian, sliced
 from slipid.infer.posterior.variance_likelihood import (
@@ -97,29 +104,50 @@ def added_covariance(
     """Return the covariance that uncertain variances add to that of the parameters of the motion.
 
     With variances v that are drawn, the covariance is E[cov | v] + Cov(mean | v); the covariance at
-    the fitted variances is subtracted. Negative eigenvalues of the difference are set to zero.
+    the fitted variances is subtracted. Negative eigenvalues of the difference, relative to that
+    covariance, are set to zero.
     Source: Kass and Steffey 1989, Journal of the American Statistical Association 84(407).
     """
     part = linear_parts(problem, fitted)[0]
     some = draws.reshape(-1, draws.shape[-1])
     some = some[np.linspace(0, len(some) - 1, _CONDITIONED).astype(int)]
     floors, at = floor_runs(part), weights_at(problem, fitted)
-    before = conditional(part, floors, at, fitted.log_variance).covariance
-    found = [conditional(part, floors, at, log_v) for log_v in some]
-    over = np.mean([x.covariance for x in found], axis=0) + np.cov(
-        [x.mean for x in found], rowvar=False
+
+    def given(log_v: Variances) -> Conditional:
+        return conditional(_with_pooled(part, problem, fitted, log_v), floors, at, log_v)
+
+    before, found = given(fitted.log_variance).covariance, [given(log_v) for log_v in some]
+    between = np.cov([x.mean for x in found], rowvar=False)
+    excess = np.mean([x.covariance for x in found], axis=0) + between - before
+    joint, out = problem.objective.joint, np.zeros_like(before)
+    mine = np.ix_(*[np.flatnonzero(~problem.space.electric | joint)] * 2)
+    root = np.linalg.cholesky(before[mine])
+    value, vector = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, excess[mine]).T))
+    out[mine] = (root @ vector * np.maximum(value, 0.0)) @ (root @ vector).T
+    return out
+
+
+def _with_pooled(
+    part: LinearPart, problem: Problem, fitted: Fitted, log_v: Variances
+) -> LinearPart:
+    """Return the part with the prior of the load biases that their drawn variance gives."""
+    number = problem.objective.pooled
+    more = np.exp(-log_v[number]) - np.exp(-fitted.log_variance[number])
+    stiffer = np.where(problem.space.pooled, more, 0.0)
+    return replace(
+        part,
+        precision=part.precision + np.diag(stiffer),
+        pull=part.pull + stiffer * (problem.space.prior_mean - fitted.z),
     )
-    mine = ~problem.space.electric if not problem.objective.joint else np.ones(len(over), bool)
-    value, vector = np.linalg.eigh((over - before) * np.outer(mine, mine))
-    return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T)
 
 
 def weights_at(problem: Problem, fitted: Fitted) -> dict[str, np.ndarray]:
-    """Return the weight of every segment at a fit, keyed by block."""
+    """Return the weight of every segment at a fit as in the posterior, keyed by block."""
     residual, _ = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
     effect = effects_at(problem, residual, fitted.log_variance)
     weighed = problem.weighed(residual, fitted.log_variance, problem.full_weight, effect)
-    return {k: np.asarray(weight) for k, weight in weighed.whitening.weight.items()}
+    weight = weighed.whitening.weight
+    return {k: expected(r.shape[-1]) * np.asarray(weight[k]) for k, r in residual.items()}
 
 
 class Conditional(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_t
 
 from slipid.fitting.noise import Components
-from slipid.fitting.problem import Problem
+from slipid.fitting.problem import Problem, log_jacobian
 from slipid.fitting.shared_effects import SharedEffects
 from slipid.fitting.variances import VARIANCE_SPREAD
 from slipid.infer.posterior.coordinates import Fitted
@@ -197,8 +197,13 @@ def dense_estimate(problem, part, weight, log_v):
         whole[k * m : (k + 1) * m, k * m : (k + 1) * m] += v
     flat = rows.reshape(n * m, columns)
     information = flat.T @ np.linalg.solve(whole, flat)
-    covariance = np.linalg.inv(part.precision + information[:-1, :-1])
-    return covariance @ (part.pull - information[:-1, -1]), covariance
+    space, z = problem.space, problem.space.start
+    std = np.where(space.pooled, np.exp(0.5 * log_v[problem.objective.pooled]), space.prior_std)
+    electric = problem.electric(z, problem.objective.typical)
+    slope = log_jacobian(problem.objective, z, electric, np.ones(n))[1]
+    pull = (space.prior_mean - z) / std**2 + np.asarray(slope) - information[:-1, -1]
+    covariance = np.linalg.inv(np.diag(std**-2.0) + information[:-1, :-1])
+    return covariance @ pull, covariance
 
 
 def test_uncertain_variances_add_to_the_covariance_of_the_motion(problem, fitted):
