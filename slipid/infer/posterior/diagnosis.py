@@ -78,10 +78,11 @@ class Posterior:
 
     Attributes:
         fit: fit around which the chains were started.
-        z: draws of the search vector.
+        z: draws of the search vector, those of the motion widened by what uncertain variances add.
         log_variance: draws of the log variances.
         log_prob: log density of the parameters that were sampled by chains: all parameters, or the
-            motion parameters if currents were logged.
+            motion parameters if currents were logged, at the positions of the chains, before the
+            draws are widened.
         names: names of the coordinates that were sampled by chains.
         diagnosis: convergence of the chains.
         accepted: fraction of accepted moves, keyed by part of the posterior.

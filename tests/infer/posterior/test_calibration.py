@@ -97,6 +97,32 @@ def test_electric_draws_with_few_accepted_proposals_prevent_convergence(whole, m
     )
 
 
+@pytest.mark.slow
+def test_uncertain_variances_widen_draws_of_the_motion_and_what_is_drawn_given_it(
+    whole, monkeypatch
+):
+    """The widened motion has the covariance that is added, and electric draws are given it."""
+    fit, plan, blocks, _ = whole
+    motion, drawn, given = ~fit.space.electric, posterior.electric_given_motion, []
+
+    def spied(first, second, covariance, x, *more):
+        given.append(x)
+        return drawn(first, second, covariance, x, *more)
+
+    monkeypatch.setattr(posterior, "electric_given_motion", spied)
+    found = []
+    for size in (0.0, 1e-6):
+        added = size * np.outer(motion, motion) * np.eye(fit.space.size)
+        monkeypatch.setattr(posterior, "added_covariance", lambda *_, added=added: added)
+        found.append(posterior.sampled(fit, plan, 400, blocks, QUIET))
+    off = (found[1].z - found[0].z)[..., motion]
+    np.testing.assert_allclose(off.std(axis=(0, 1)), 1e-3, rtol=0.12)
+    assert np.abs(np.corrcoef(off.reshape(800, -1).T) - np.eye(motion.sum())).max() < 0.2
+    for posterior_, x in zip(found, given, strict=True):
+        np.testing.assert_array_equal(posterior_.z[..., motion], x)
+    np.testing.assert_array_equal(found[0].log_prob, found[1].log_prob)
+
+
 @pytest.fixture(scope="module")
 def whole():
     """Yield an experiment, with blocks and draws of its posterior; few sweeps draw variances."""
