@@ -1,4 +1,4 @@
-"""What runs over several floors teach, on robots of the virtual test site and in the 2022 logs.
+"""Runs over several floors as a part of a fit, on robots of the test site and in the 2022 logs.
 
 Robots drawn anew drive over four floors, one at a time, and over a patchwork of them. Each robot is
 fitted without and with the runs over the patchwork, and its runs over another patchwork, which no
@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slipid.cli.main import app
-from tests.benchmarks.quick import quick
+from tests.benchmarks.quick import QUICK, quick
 from tests.benchmarks.record import record
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -120,6 +120,8 @@ def test_robots_of_the_test_site(seed: int, tmp_path: Path) -> None:
         fitted = without(config, maps, name.replace(" ", "_"))
         out = tmp_path / fitted.stem
         invoke("identify", fitted, "--data", tmp_path / "logs", "--out", out, "--quiet")
+        accepted = json.loads((out / "fit.json").read_text()).get("mixed") is not None
+        assert accepted == (name != "one floor at a time")
         speed, yaw = errors_over_several(out, unseen, tmp_path / "logs")
         speeds.append(speed)
         found = json.loads((out / "identified.json").read_text())["parameters"]
@@ -137,10 +139,11 @@ def test_robots_of_the_test_site(seed: int, tmp_path: Path) -> None:
             100 * closing[c]["closure_error_median"] / closing["encoder"]["closure_error_median"]
             for c in ("contact", "contact_gyro")
         ]
-        rows.append([seed, name, 1000 * speed, yaw, error, ", ".join(verdicts), *closure])
+        numbers = [f"{1000 * speed:.1f}", f"{yaw:.3f}", f"{error:.3f}", ", ".join(verdicts)]
+        rows.append([seed, name, *numbers, *(f"{c:.0f}" for c in closure)])
         print(rows[-1], flush=True)
     record("across_floors", rows, keys=2)
-    assert speeds[1] < 1.05 * speeds[0]
+    assert QUICK or speeds[1] < speeds[0]
 
 
 def test_the_pair_of_floors_in_the_2022_logs(real_data: Path, tmp_path: Path) -> None:

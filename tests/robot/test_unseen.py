@@ -159,17 +159,18 @@ def end_after(
     )
 
 
-WAYS = (0.3, 1.2, 2.5)
+DIRECTIONS = (0.3, 1.2, 2.5)
+"""Directions of travel [rad]."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("numbers", "each", "mean"), [(SOFT, 0.7, 0.5), (OTHER, 0.95, 0.8)])
 def test_an_unfamiliar_floor_is_identified_by_its_currents(numbers, each, mean):
-    """By how much depends on how near the true floor is to one of the few unseen ones."""
+    """The gain differs between directions, since only a few unseen floors are kept."""
     before, after = [], []
-    for way in WAYS:
-        true, pose = end_after(deployed(), numbers, way)
-        _, wider = end_after(deployed().with_unseen(), numbers, way)
+    for direction in DIRECTIONS:
+        true, pose = end_after(deployed(), numbers, direction)
+        _, wider = end_after(deployed().with_unseen(), numbers, direction)
         before.append(float(np.hypot(*(pose - true)[:2])))
         after.append(float(np.hypot(*(wider - true)[:2])))
     assert (np.asarray(after) < each * np.asarray(before)).all()
