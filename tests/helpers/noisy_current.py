@@ -35,7 +35,7 @@ STD = {
 }
 SIGNAL = 0.1
 """Std of the currents that flow, about [A]."""
-MU = 0.14
+MU = 0.15
 """Friction of the floors, for currents of this size."""
 FREE = [
     Choice("*", free=False),

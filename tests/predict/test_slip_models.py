@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -134,8 +135,12 @@ def test_the_lookup_learns_a_smooth_series_of_each_floor_and_load():
 
 @pytest.mark.slow
 def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
-    """Where a sector is left out it has to be held down harder than where it interpolates."""
-    w = made(ROBOT, runs=96, count=2, seed=4)
+    """Where a sector is left out it has to be held down harder than where it interpolates.
+
+    The floor has a sharp knee, so that slip varies much between sectors.
+    """
+    sharp = eqx.tree_at(lambda r: r.surfaces.knee_width, ROBOT, jnp.full(2, 0.65))
+    w = made(sharp, runs=96, count=2, seed=4)
     sector = w.run * 6 // 96
     error, size = {}, {}
     for name, together in {"sectors": sector, "at random": None}.items():
