@@ -107,7 +107,7 @@ class Plan:
     warm_up: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
     most: int = 400
     spread: float = 2.0
-    rows: int = 1500
+    rows: int = 3000
     r_hat: float = 1.01
     steps_per_tau: float = 50.0
     least_draws: float = 1000.0
