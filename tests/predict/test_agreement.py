@@ -75,20 +75,21 @@ def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green
 
 
 @pytest.mark.parametrize(
-    ("sigma", "held_out", "reason"),
+    ("sigma", "held_out", "by_map", "reason"),
     [
-        (3.9, 1.1, None),
-        (3.9, None, None),
-        (25.0, 0.9, "changes by 25 standard errors"),
-        (25.0, None, "changes by 25 standard errors"),
-        (25.0, 0.7, None),  # held-out runs confirm it
-        (np.inf, 0.7, "did not converge"),
+        (3.9, 1.1, 0.02, None),
+        (3.9, None, 0.02, None),
+        (25.0, 0.9, 0.02, "changes by 25 standard errors"),
+        (25.0, None, 0.02, "changes by 25 standard errors"),
+        (25.0, 0.3, 0.045, "changes by 25 standard errors"),  # a mirrored map
+        (25.0, 0.7, 0.02, None),  # held-out runs and the map confirm it
+        (np.inf, 0.7, 0.02, "did not converge"),
     ],
 )
-def test_numbers_that_move_far_are_a_contradiction_unless_held_out_runs_confirm_it(
-    sigma, held_out, reason
+def test_numbers_that_move_far_are_a_contradiction_unless_held_out_runs_and_the_map_confirm_it(
+    sigma, held_out, by_map, reason
 ):
-    found = contradiction(FINE, ("robot.load_share", sigma), 0.02, {"gray": 0.05}, held_out)
+    found = contradiction(FINE, ("robot.load_share", sigma), by_map, {"gray": 0.05}, held_out)
     assert found is None if reason is None else reason in found
 
 
