@@ -57,7 +57,7 @@ CONFIRMED_RATIO = 0.8
 
 The error of each half that the other half predicts has to be so much less than that without such
 runs, and the error with the map so much less than those as if all wheels were on one floor: with a
-mirrored map of the test site the former was 0.33, the latter 0.94 (with the right one 0.10, 0.40).
+mirrored map of the test site the former was 0.33, the latter 0.94 (with the right one 0.10, 0.36).
 
 Runs on one floor each can leave several laws possible, whose parameters are many standard errors
 apart. Runs over several floors then decide between these laws.
