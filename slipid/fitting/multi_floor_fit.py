@@ -78,7 +78,7 @@ def fit_multi_floor(
     """Fit all runs together, starting at the optimum of the runs on one floor each.
 
     `tell` is called after every round of the fit to all runs; `most_rounds` and `tolerance` are
-    those of `optimise`.
+    those of `optimise`. Fits to half of the runs may have twice as many rounds.
     """
     whole = problem.with_multi_floor(multi_floor)
     start = replace(whole.carried_over(optimum.state, problem), round=0)
@@ -101,7 +101,7 @@ def fit_multi_floor(
         for half in (odd, ~odd):
             keep = np.concatenate([np.ones(len(problem.windows)), ~half])
             other = optimise(
-                whole, keep=keep, start=start, most_rounds=most_rounds, tolerance=_TOLERANCE
+                whole, keep=keep, start=start, most_rounds=2 * most_rounds, tolerance=_TOLERANCE
             )
             settled &= other.converged
             parts.append((other.state, half.astype(float)))

@@ -112,6 +112,8 @@ def errors_over_several(out: Path, config: Path, logs: Path) -> tuple[float, flo
 def test_robots_of_the_test_site(seed: int, tmp_path: Path) -> None:
     import json
 
+    from slipid.infer.fit_file import load
+
     config = simulated(seed, tmp_path)
     unseen = without(config, ("site",), "unseen")
     truth = json.loads((tmp_path / "truth" / "truth.json").read_text())["parameters"]
@@ -120,7 +122,7 @@ def test_robots_of_the_test_site(seed: int, tmp_path: Path) -> None:
         fitted = without(config, maps, name.replace(" ", "_"))
         out = tmp_path / fitted.stem
         invoke("identify", fitted, "--data", tmp_path / "logs", "--out", out, "--quiet")
-        accepted = json.loads((out / "fit.json").read_text()).get("mixed") is not None
+        accepted = load(out).mixed is not None
         assert accepted == (name != "one floor at a time")
         speed, yaw = errors_over_several(out, unseen, tmp_path / "logs")
         speeds.append(speed)
@@ -148,7 +150,7 @@ def test_robots_of_the_test_site(seed: int, tmp_path: Path) -> None:
 
 def test_the_pair_of_floors_in_the_2022_logs(real_data: Path, tmp_path: Path) -> None:
     """Each half of the 36 runs over green and table, predicted by a fit with the other half."""
-    import json
+    from slipid.infer.fit_file import load
 
     text = (ROOT / "configs/robotino2022.toml").read_text(encoding="utf-8")
     section = (
@@ -158,11 +160,11 @@ def test_the_pair_of_floors_in_the_2022_logs(real_data: Path, tmp_path: Path) ->
     config, out = tmp_path / "robot.toml", tmp_path / "out"
     config.write_text(text.replace("[camera]", section, 1), encoding="utf-8")
     invoke("identify", config, "--data", real_data / "robotino2022", "--out", out, "--quiet")
-    fit = json.loads((out / "fit.json").read_text())
-    about = fit.get("mixed") or fit["refused"]
+    fit = load(out)
+    about = fit.mixed or fit.refused
     for key in ("before", "after", "learnt"):
         print(key, about[key])
     for floor, errors in about["floors"].items():
         print(floor, errors)
-    assert quick(fit.get("mixed") is not None, True)
-    assert quick(about["after"]["speed"] < 0.8 * about["before"]["speed"], True)
+    assert QUICK or fit.mixed is not None
+    assert QUICK or about["after"]["speed"] < 0.8 * about["before"]["speed"]
