@@ -23,8 +23,8 @@ from slipid.fitting.problem import FitState, Problem
 
 _TOLERANCE = 0.1
 """Tolerance of `optimise` for a fit to half of the runs, which only serves to judge errors."""
-_SAME_DIRECTION = np.radians(15.0)
-"""Width of the sectors of direction whose runs are held out together."""
+_SECTORS = 24
+"""Number of sectors of direction; runs in the same one are held out together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +131,7 @@ def _every_second_sector(runs: MultiFloorRuns) -> Bool[np.ndarray, " segment"]:
     names, first, of_run = np.unique(w.run, return_index=True, return_inverse=True)
     last = len(w.run) - 1 - np.unique(w.run[::-1], return_index=True)[1]
     x, y = (w.pose[last, -1, :2] - w.pose[first, 0, :2]).T
-    group = np.unique(np.round(np.arctan2(y, x) / _SAME_DIRECTION), return_inverse=True)[1]
+    sector = np.round(np.arctan2(y, x) / (2 * np.pi) * _SECTORS) % _SECTORS
+    group = np.unique(sector, return_inverse=True)[1]
     group = group if group.any() else np.arange(len(names))
     return np.asarray(group[of_run] % 2 == 1)

@@ -24,7 +24,11 @@ from slipid.data.windows import Windows
 from slipid.deploy.deploy import read_robot
 from slipid.fitting import likelihood as lk
 from slipid.fitting import multi_floor as cut
-from slipid.fitting.multi_floor_fit import fit_multi_floor
+from slipid.fitting.multi_floor_fit import (
+    MultiFloorFit,
+    _every_second_sector,
+    fit_multi_floor,
+)
 from slipid.fitting.newton import newton_step
 from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import Problem
@@ -292,6 +296,44 @@ def test_pieces_left_out_change_nothing(fitted):
         seen = whole.weighed(blocks, state.log_variance, keep, state.shared(len(problem.windows)))
         losses.append(whole.loss(state.z, state.log_variance, keep, seen, electric))
     assert losses[0] == losses[1]
+
+
+def test_runs_in_the_same_direction_are_held_out_together():
+    """The two runs towards 180 degrees have headings of either sign."""
+    headings = np.radians([0, 179, 90, -179, 2, 93, 60])
+    w = still(0.0, len(headings) + 1, 2)
+    w = replace(w, run=np.array([0, 1, 2, 3, 4, 4, 5, 6]))  # the fifth run has two segments
+    steps = np.stack([np.cos(headings), np.sin(headings), 0 * headings], axis=1)[w.run]
+    pose = np.array([0.0, 0.5, 1.0])[:, None] * steps[:, None]
+    pose[5] += steps[5]
+    odd = _every_second_sector(
+        cut.MultiFloorRuns(replace(w, pose=pose), np.zeros(0), np.zeros(0), ())
+    )
+    of_run = dict(zip(w.run.tolist(), odd.tolist(), strict=True))
+    assert of_run[0] == of_run[4] == odd[4]
+    assert of_run[1] == of_run[3]
+    assert of_run[2] == of_run[5]
+    # sectors at 0, 60, 90 and 180 degrees
+    assert [of_run[k] for k in (0, 6, 2, 1)] == [False, True, False, True]
+    one = replace(w, pose=np.broadcast_to(pose[:1], pose.shape))
+    alone = _every_second_sector(cut.MultiFloorRuns(one, np.zeros(0), np.zeros(0), ()))
+    assert alone.tolist() == (w.run % 2 == 1).tolist()
+
+
+def test_the_gain_of_held_out_runs_is_that_of_the_worse_channel_and_needs_currents():
+    before = cut.WindowErrors(0.04, 0.2, 0.3)
+
+    def gain(speed, yaw_rate, current, settled=True):
+        after = cut.WindowErrors(speed, yaw_rate, current)
+        found = MultiFloorFit(None, None, before, after, after, settled, {})
+        return found.gain
+
+    assert gain(0.01, 0.1, 0.2) == pytest.approx(0.5)
+    assert gain(0.03, 0.1, 0.3) == pytest.approx(0.75)
+    assert gain(0.01, 0.1, None) == pytest.approx(0.5)
+    assert gain(0.01, 0.1, 0.31) is None
+    assert gain(0.01, 0.1, 0.2, settled=False) is None
+    assert MultiFloorFit(None, None, before, None, before, False, {}).gain is None
 
 
 @pytest.mark.slow

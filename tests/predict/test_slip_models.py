@@ -135,7 +135,7 @@ def test_the_lookup_learns_a_smooth_series_of_each_floor_and_load():
 
 @pytest.mark.slow
 def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
-    """Where a sector is left out it has to be held down harder than where it interpolates.
+    """Ridges are larger if sectors are held out than if the lookup interpolates.
 
     The floor has a sharp knee, so that slip varies much between sectors.
     """

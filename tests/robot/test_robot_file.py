@@ -184,10 +184,10 @@ def rewritten(path: Path, change) -> None:
 def refused(path: Path) -> str:
     with pytest.raises(DataError) as caught:
         DeployedRobot.load(path)
-    said = str(caught.value)
-    assert said.startswith(f"{path}: ")
-    assert "\n" not in said
-    return said
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message
 
 
 def test_what_is_no_robot_is_refused(tmp_path):
@@ -213,17 +213,17 @@ def test_what_is_no_robot_is_refused(tmp_path):
 
 def test_a_newer_file_asks_for_an_update(path):
     rewritten(path, lambda c: c.update(schema="slipid.robot/10", more=3))
-    said = refused(path)
-    assert "written by a newer slipid as slipid.robot/10" in said
-    assert "update slipid" in said
+    message = refused(path)
+    assert "written by a newer slipid as slipid.robot/10" in message
+    assert "update slipid" in message
 
 
 def test_an_older_file_whose_law_was_another_is_to_be_written_anew(path):
     """Forces saturated as tanh, which is no shape of a knee."""
     rewritten(path, lambda c: c.update(schema="slipid.robot/8"))
-    said = refused(path)
-    assert "written by an older slipid as slipid.robot/8" in said
-    assert "write it again with `slipid identify`" in said
+    message = refused(path)
+    assert "written by an older slipid as slipid.robot/8" in message
+    assert "write it again with `slipid identify`" in message
 
 
 def test_limits_without_logs_follow_from_the_robots_own_wheels():
