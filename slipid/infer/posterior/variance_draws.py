@@ -39,10 +39,9 @@ from slipid.fitting.variances import (
     Search,
     Square,
     Variances,
-    expected,
     information,
 )
-from slipid.infer.posterior.coordinates import Fitted, effects_at
+from slipid.infer.posterior.coordinates import Anchor, Fitted
 from slipid.infer.posterior.moves import Chains, hamiltonian, sliced
 from slipid.infer.posterior.variance_likelihood import (
     LinearPart,
@@ -142,12 +141,8 @@ def _with_pooled(
 
 
 def weights_at(problem: Problem, fitted: Fitted) -> dict[str, np.ndarray]:
-    """Return the weight of every segment at a fit as in the posterior, keyed by block."""
-    residual, _ = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
-    effect = effects_at(problem, residual, fitted.log_variance)
-    weighed = problem.weighed(residual, fitted.log_variance, problem.full_weight, effect)
-    weight = weighed.whitening.weight
-    return {k: expected(r.shape[-1]) * np.asarray(weight[k]) for k, r in residual.items()}
+    """Return the weight of every segment in the posterior around a fit, keyed by block."""
+    return {k: np.asarray(x) ** 2 for k, x in Anchor.at(problem, fitted).scale.items()}
 
 
 class Conditional(NamedTuple):

@@ -11,15 +11,14 @@ from scipy.stats import multivariate_t
 from slipid.fitting.noise import Components
 from slipid.fitting.problem import Problem, log_jacobian
 from slipid.fitting.shared_effects import SharedEffects
-from slipid.fitting.variances import VARIANCE_SPREAD
-from slipid.infer.posterior.coordinates import Fitted
+from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD
+from slipid.infer.posterior.coordinates import Fitted, effects_at
 from slipid.infer.posterior.variance_draws import (
     added_covariance,
     drawn_variances,
     floor_information,
     floor_runs,
     sweeps,
-    weights_at,
 )
 from slipid.infer.posterior.variance_likelihood import (
     LinearPart,
@@ -211,7 +210,13 @@ def test_uncertain_variances_add_to_the_covariance_of_the_motion(problem, fitted
     part = linear_parts(problem, fitted)[0]
     larger = fitted.log_variance + np.log(4.0)
     draws = np.stack([np.tile(fitted.log_variance, (200, 1)), np.tile(larger, (200, 1))])
-    weight, motion = weights_at(problem, fitted)["motion"], ~problem.space.electric
+    residual, _ = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
+    effect = effects_at(problem, residual, fitted.log_variance)
+    weighed = problem.weighed(residual, fitted.log_variance, problem.full_weight, effect)
+    count = residual["motion"].shape[1]
+    weight = np.asarray(weighed.whitening.weight["motion"])
+    weight = weight * (DEGREES + count) / (DEGREES + count + 2)  # information of a Student t
+    motion = ~problem.space.electric
     (first, before), (second, wide) = (
         dense_estimate(problem, part, weight, v) for v in (fitted.log_variance, larger)
     )
