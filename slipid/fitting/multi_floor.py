@@ -232,6 +232,16 @@ class WindowErrors(NamedTuple):
     yaw_rate: float
     current: float | None
 
+    def over(self, before: "WindowErrors") -> float | None:
+        """Return the larger ratio of these errors to others, of the speed and of the yaw rate.
+
+        It is None if the currents, which know of the map as well, are predicted worse than before.
+        """
+        if self.current is not None and self.current > (before.current or 0.0):
+            return None
+        pairs = (self.speed, before.speed), (self.yaw_rate, before.yaw_rate)
+        return max(new / max(old, 1e-12) for new, old in pairs)
+
 
 def window_errors(
     multi_floor: MultiFloorBatch,

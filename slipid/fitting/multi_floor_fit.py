@@ -53,18 +53,14 @@ class MultiFloorFit:
 
     @property
     def gain(self) -> float | None:
-        """Largest ratio of held-out errors with the other half of the runs to those without.
+        """Ratio of held-out errors with the other half of the runs to those without.
 
-        It is that of the speed or of the yaw rate. None if it is not known, or if the currents,
-        which know of the map as well, are predicted worse.
+        None if no run was held out, if a fit to half of the runs did not converge, or if the
+        currents are predicted worse.
         """
-        before, after = self.before, self.after
-        if after is None or not self.settled:
+        if self.after is None or not self.settled:
             return None
-        if after.current is not None and after.current > (before.current or 0.0):
-            return None
-        pairs = (after.speed, before.speed), (after.yaw_rate, before.yaw_rate)
-        return max(new / max(old, 1e-12) for new, old in pairs)
+        return self.after.over(self.before)
 
 
 def fit_multi_floor(

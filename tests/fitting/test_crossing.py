@@ -25,7 +25,6 @@ from slipid.deploy.deploy import read_robot
 from slipid.fitting import likelihood as lk
 from slipid.fitting import multi_floor as cut
 from slipid.fitting.multi_floor_fit import (
-    MultiFloorFit,
     _every_second_sector,
     fit_multi_floor,
 )
@@ -214,6 +213,9 @@ def test_left_out_halves_are_predicted_down_to_the_noise(learnt):
     noise = np.sqrt(2) * np.array([1.1 * PLACE, HEADING]) / 0.25
     assert learnt.after.yaw_rate < learnt.before.yaw_rate
     assert learnt.after.speed < learnt.before.speed
+    assert learnt.gain == learnt.after.over(learnt.before) < 1
+    assert replace(learnt, settled=False).gain is None
+    assert replace(learnt, after=None).gain is None
     assert learnt.after.yaw_rate == pytest.approx(noise[1], rel=0.15)
     assert learnt.after.speed == pytest.approx(np.sqrt(2) * noise[0], rel=0.25)
     assert learnt.after.current == pytest.approx(np.hypot(CURRENT, OFFSET), rel=0.25)
@@ -306,9 +308,12 @@ def test_runs_in_the_same_direction_are_held_out_together():
     steps = np.stack([np.cos(headings), np.sin(headings), 0 * headings], axis=1)[w.run]
     pose = np.array([0.0, 0.5, 1.0])[:, None] * steps[:, None]
     pose[5] += steps[5]
-    odd = _every_second_sector(
-        cut.MultiFloorRuns(replace(w, pose=pose), np.zeros(0), np.zeros(0), ())
-    )
+
+    def halves(windows):
+        floor, counts = np.zeros((8, 2, 3), int), np.ones((8, 2), bool)
+        return _every_second_sector(cut.MultiFloorRuns(windows, floor, counts, ()))
+
+    odd = halves(replace(w, pose=pose))
     of_run = dict(zip(w.run.tolist(), odd.tolist(), strict=True))
     assert of_run[0] == of_run[4] == odd[4]
     assert of_run[1] == of_run[3]
@@ -316,24 +321,19 @@ def test_runs_in_the_same_direction_are_held_out_together():
     # sectors at 0, 60, 90 and 180 degrees
     assert [of_run[k] for k in (0, 6, 2, 1)] == [False, True, False, True]
     one = replace(w, pose=np.broadcast_to(pose[:1], pose.shape))
-    alone = _every_second_sector(cut.MultiFloorRuns(one, np.zeros(0), np.zeros(0), ()))
-    assert alone.tolist() == (w.run % 2 == 1).tolist()
+    assert halves(one).tolist() == (w.run % 2 == 1).tolist()
 
 
 def test_the_gain_of_held_out_runs_is_that_of_the_worse_channel_and_needs_currents():
     before = cut.WindowErrors(0.04, 0.2, 0.3)
 
-    def gain(speed, yaw_rate, current, settled=True):
-        after = cut.WindowErrors(speed, yaw_rate, current)
-        found = MultiFloorFit(None, None, before, after, after, settled, {})
-        return found.gain
+    def gain(speed, yaw_rate, current):
+        return cut.WindowErrors(speed, yaw_rate, current).over(before)
 
     assert gain(0.01, 0.1, 0.2) == pytest.approx(0.5)
     assert gain(0.03, 0.1, 0.3) == pytest.approx(0.75)
     assert gain(0.01, 0.1, None) == pytest.approx(0.5)
     assert gain(0.01, 0.1, 0.31) is None
-    assert gain(0.01, 0.1, 0.2, settled=False) is None
-    assert MultiFloorFit(None, None, before, None, before, False, {}).gain is None
 
 
 @pytest.mark.slow
