@@ -45,6 +45,8 @@ class Declaration:
         doc: meaning of the parameter, in one line.
         electric: True if the parameter is estimated from currents and voltages given the motion,
             not from the motion.
+        relative: True if the values are ratios to that of the first label, which is fixed unless
+            the user frees it.
         of: object to which each element of a vector belongs: a wheel, a drive or an axis.
     """
 
@@ -60,6 +62,7 @@ class Declaration:
     closed: bool = False
     doc: str = ""
     electric: bool = False
+    relative: bool = False
     of: str = "wheel"
 
     @property

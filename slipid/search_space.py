@@ -188,7 +188,7 @@ def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any,
     """
     d = entry.declaration
     usual = np.full(entry.size, 1 / entry.size if d.shares else d.start)
-    is_free, mean_si, std_si = d.free, None, None
+    is_free, mean_si, std_si = d.free and not (d.relative and entry.index == 0), None, None
     for c in picked:
         if c.fixed is not None:
             value, is_free = _checked_value(entry, c.fixed, fixed=True), False

@@ -121,6 +121,7 @@ def test_paths_of_the_contract():
         "motor.back_emf",
         "robot.load_share@as_built",
         "robot.load_share@moved",
+        "robot.mass_ratio@moved",
         "robot.wheel_radius",
         "robot.drive_offset",
         "surface.gray.creep",

@@ -47,19 +47,32 @@ from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
 
 
-def share_priors(weights: Mapping[str, WeightsSection], shape: Geometry) -> dict[str, Choice]:
-    """Return the prior of the load shares for each load set-up with known weights, keyed by name.
+def weight_priors(
+    weights: Mapping[str, WeightsSection], shape: Geometry, first: str
+) -> dict[str, tuple[Choice, ...]]:
+    """Return priors for each load set-up with known weights, keyed by its name.
+
+    They are priors of the load shares, and of the mass over that of the load set-up `first` if its
+    weights are known as well.
 
     Raises:
         ValueError: a set-up refers to an unknown one or to itself, or a wheel would have no weight
             on it.
     """
-    out = {}
-    for name in weights:
-        kg, variance = _wheel_weights(weights, name, shape, ())
+    known = {name: _wheel_weights(weights, name, shape, ()) for name in weights}
+    out: dict[str, tuple[Choice, ...]] = {}
+    for name, (kg, variance) in known.items():
         whole, std = kg.sum(), float(np.sqrt(variance)) / kg.sum()
         share = (kg / whole).tolist()
-        out[name] = Choice(f"robot.load_share@{name}", prior_mean=share, prior_std=[std] * len(kg))
+        out[name] = (
+            Choice(f"robot.load_share@{name}", prior_mean=share, prior_std=[std] * len(kg)),
+        )
+        if name != first and first in known:
+            kg_first, variance_first = known[first]
+            ratio = float(whole / kg_first.sum())
+            std = np.hypot(std, np.sqrt(variance_first) / kg_first.sum()) * np.sqrt(len(kg))
+            mass = Choice(f"robot.mass_ratio@{name}", prior_mean=ratio, prior_std=ratio * std)
+            out[name] += (mass,)
     return out
 
 
@@ -550,12 +563,13 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str], int
     choices += measured
     skipped += lines
     try:
-        known = share_priors(config.content.weights, robot.geometry)
+        first = robot.body.loads[0]
+        known = weight_priors(config.content.weights, robot.geometry, first)
     except ValueError as error:
         raise DataError(f"{config.path}: {error}") from error
-    for load, prior in known.items():
+    for load, priors in known.items():
         if load in robot.body.loads:
-            choices.append(prior)
+            choices += priors
         else:
             skipped.append(f"skipped: weights.{load}: no run has this load set-up")
     before = len(choices)

@@ -231,7 +231,7 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
     # `motor_force` is in units of mu m g with mu averaged over the wheels; `weight` is that unit.
     friction = robot.surfaces.friction[b.surface]
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
-    weight = friction * robot.body.mass * GRAVITY
+    weight = friction * robot.body.mass_in(b.load)[:, None] * GRAVITY
     torque = (
         robot.geometry.wheel_radius * weight[..., None] * robot.motor.opposing_force(motor_force)
     )

@@ -183,7 +183,7 @@ def by_heading(
 def _currents_and_drag(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
     """Return predicted currents [A], and torques of the drag in the drive direction [N m]."""
     motor_force = lk.predict(robot, b).motor_force
-    force = robot.surfaces.friction[b.surface] * robot.body.mass * GRAVITY
+    force = robot.surfaces.friction[b.surface] * robot.body.mass_in(b.load) * GRAVITY
     drag = robot.motor.rolling_drag * motor_force[..., 1]
     torque = robot.geometry.wheel_radius * force[:, None, None] * drag
     return lk.predicted_current(robot, b, motor_force), torque

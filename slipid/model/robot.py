@@ -27,7 +27,11 @@ GRAVITY = 9.81
 
 
 class Body(eqx.Module):
-    """Mass, inertia and load shares; the leading axis of `load_share` is the load set-up."""
+    """Mass, inertia and load shares.
+
+    The leading axis of `load_share` and of `mass_ratio` is the load set-up; `mass` is that of the
+    first one.
+    """
 
     mass: Array = known("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1)
     yaw_inertia: Array = known(
@@ -42,7 +46,22 @@ class Body(eqx.Module):
         shares=True,
         per="loads",
     )
+    mass_ratio: Array = parameter(
+        "1",
+        "m/m_1",
+        "mass over that in the first load set-up, from currents",
+        start=1.0,
+        lower=0.0,
+        spread=0.15,
+        electric=True,
+        relative=True,
+        per="loads",
+    )
     loads: tuple[str, ...] = eqx.field(static=True, default=("as_built",))
+
+    def mass_in(self, load: Int[Array, "*some"] | int) -> Float[Array, "*some"]:
+        """Return the mass in load set-ups of given indices [kg]."""
+        return self.mass * self.mass_ratio[load]
 
 
 class Robot(eqx.Module):
@@ -107,7 +126,8 @@ class Robot(eqx.Module):
         load set-up.
         """
         rest = self.body.load_share[load]
-        return Standing(frame, self.surfaces.at(surface), rest, self.motor, self.body.mass)
+        mass = self.body.mass_in(load)
+        return Standing(frame, self.surfaces.at(surface), rest, self.motor, mass)
 
     def surface_index(self, name: str) -> int:
         """Return the index of a floor in `surfaces`; raise `ValueError` if it is unknown."""
@@ -237,7 +257,9 @@ def build(
     return Robot(
         geometry=geometry,
         body=Body(
-            load_share=as_numbers(np.full((len(loads), wheels), 1 / wheels)), loads=tuple(loads)
+            load_share=as_numbers(np.full((len(loads), wheels), 1 / wheels)),
+            mass_ratio=as_numbers(np.ones(len(loads))),
+            loads=tuple(loads),
         ),
         motor=Motor(gear_ratio=as_numbers(geometry.gear_ratio)),
         surfaces=ContactSurface(

@@ -291,7 +291,9 @@ def _arrays(
             labels=record.labels,
         ),
         rest=as_numbers(np.atleast_1d(values[f"robot.load_share@{chosen.name}"])),
-        mass=as_numbers(values["robot.mass"]),
+        mass=as_numbers(
+            np.asarray(values["robot.mass"]) * values[f"robot.mass_ratio@{chosen.name}"]
+        ),
         process=as_numbers([floor.process for floor in floors]),
         effect=as_numbers(whole if spread else effect),
         effect_table=_effect_table(chosen, whole),

@@ -40,7 +40,8 @@ class Load:
 
     Attributes:
         path: path of the body's inertia along the axis.
-        factor: inertia at the wheel per inertia of the body, r^2 / (J^T J)_kk [m^2 or 1].
+        factor: inertia at the wheel per inertia of the body, r^2 / (J^T J)_kk [m^2 or 1]; for the
+            mass times its ratio in the load set-up.
     """
 
     path: str
@@ -85,8 +86,11 @@ def _loads(robot: DeployedRobot) -> dict[str, Load | None]:
     coupling = np.abs(unit.T @ unit - np.eye(len(axes))).max()
     if not coupling <= LARGEST_COUPLING:  # NaN if no wheel drives along an axis
         return {"wheel": None}
+    ratio = {MASS: float(robot.mass / np.asarray(robot.record.parameters[MASS].value))}
     return {
-        name: Load(path, squared_radius / float(forward[:, k] @ forward[:, k]))
+        name: Load(
+            path, ratio.get(path, 1.0) * squared_radius / float(forward[:, k] @ forward[:, k])
+        )
         for name, (k, path) in axes.items()
     }
 

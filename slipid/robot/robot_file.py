@@ -116,7 +116,7 @@ def _wrong(where: str, value: object, expected: str) -> ValueError:
     return ValueError(f"{where}: {shown}; expected {expected}")
 
 
-SCHEMA = "slipid.robot/9"
+SCHEMA = "slipid.robot/10"
 REWRITE_HINT = "copy it again, or write it again with `slipid identify`"
 
 

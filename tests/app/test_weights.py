@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slipid.app.config import WeightsSection, parsed
-from slipid.app.problem import read_fit_task, share_priors
+from slipid.app.problem import read_fit_task, weight_priors
 from slipid.model.geometry import mecanum, omni
 from slipid.search_space import Space
 from slipid.support.errors import DataError
@@ -20,7 +20,7 @@ SCALES = WeightsSection(kg=[3.0, 5.0, 4.0], std_kg=0.06)
 
 
 def test_scales_are_shares():
-    prior = share_priors({"as_built": SCALES}, SHAPE)["as_built"]
+    prior = weight_priors({"as_built": SCALES}, SHAPE, "none")["as_built"][0]
     assert prior.pattern == "robot.load_share@as_built"
     assert prior.prior_mean == pytest.approx([0.25, 5 / 12, 1 / 3])
     assert prior.prior_std == pytest.approx([0.005] * 3)
@@ -28,7 +28,7 @@ def test_scales_are_shares():
 
 def test_a_mass_at_a_place_keeps_the_balance_of_forces_and_moments():
     added = WeightsSection(like="as_built", mass_kg=1.5, place_m=(0.03, -0.02), std_kg=0.08)
-    prior = share_priors({"moved": added, "as_built": SCALES}, SHAPE)["moved"]
+    prior = weight_priors({"moved": added, "as_built": SCALES}, SHAPE, "none")["moved"][0]
     kg = np.asarray(prior.prior_mean) * 13.5
     place = np.asarray(SHAPE.place) * 0.125
     more = kg - SCALES.kg
@@ -40,7 +40,7 @@ def test_a_mass_at_a_place_keeps_the_balance_of_forces_and_moments():
 def test_a_mass_above_a_wheel_of_three_is_on_that_wheel():
     place = tuple(np.asarray(SHAPE.place)[1] * 0.125)
     added = WeightsSection(like="as_built", mass_kg=-1.0, place_m=place, std_kg=0.05)
-    prior = share_priors({"as_built": SCALES, "light": added}, SHAPE)["light"]
+    prior = weight_priors({"as_built": SCALES, "light": added}, SHAPE, "none")["light"][0]
     assert np.asarray(prior.prior_mean) * 11 == pytest.approx([3.0, 4.0, 4.0])
 
 
@@ -48,8 +48,18 @@ def test_four_wheels_share_what_is_in_the_middle():
     shape = mecanum(0.2, 0.15, 0.05)
     even = WeightsSection(kg=[2.0, 2.0, 3.0, 3.0], std_kg=0.1)
     added = WeightsSection(like="a", mass_kg=4.0, place_m=(0.0, 0.0), std_kg=0.1)
-    prior = share_priors({"a": even, "b": added}, shape)["b"]
+    prior = weight_priors({"a": even, "b": added}, shape, "none")["b"][0]
     assert np.asarray(prior.prior_mean) * 14 == pytest.approx([3.0, 3.0, 4.0, 4.0])
+
+
+def test_masses_over_that_of_the_first_load_setup_need_both_weights():
+    heavy = WeightsSection(kg=[4.0, 6.0, 5.0], std_kg=0.15)
+    share, mass = weight_priors({"heavy": heavy, "light": SCALES}, SHAPE, "light")["heavy"]
+    assert share.pattern == "robot.load_share@heavy"
+    assert (mass.pattern, mass.prior_mean) == ("robot.mass_ratio@heavy", pytest.approx(1.25))
+    # of three scales: 0.15 sqrt(3) of 15 kg and 0.06 sqrt(3) of 12 kg
+    assert mass.prior_std == pytest.approx(1.25 * np.sqrt(3) * np.hypot(0.01, 0.005))
+    assert len(weight_priors({"heavy": heavy}, SHAPE, "light")["heavy"]) == 1
 
 
 WEIGHTS = """

@@ -26,9 +26,15 @@ def known(shape: Geometry, floors: Sequence[str] = ("firm", "soft")) -> Deployed
     share = jnp.arange(1.0, shape.wheels + 1)
     share = jnp.stack([jnp.full(shape.wheels, 1 / shape.wheels), share / share.sum()])
     made = eqx.tree_at(
-        lambda r: (r.surfaces.friction, r.surfaces.creep, r.body.load_share, r.motor.rotor_inertia),
+        lambda r: (
+            r.surfaces.friction,
+            r.surfaces.creep,
+            r.body.load_share,
+            r.body.mass_ratio,
+            r.motor.rotor_inertia,
+        ),
         made,
-        (0.3 * some, 0.1 * some**2, share, jnp.asarray(1e-5 / 3)),
+        (0.3 * some, 0.1 * some**2, share, jnp.asarray([1.0, 1.3]), jnp.asarray(1e-5 / 3)),
     )
     std = {
         f"process.{f}.{a}": 0.003 * (k + n + 1)

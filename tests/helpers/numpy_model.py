@@ -84,7 +84,8 @@ class Rival:
         driven = (
             traction + s["rolling_resistance"] * saturated(along / sets_in, contact_law.KNEE)[0]
         )
-        weight = s["friction"] * v["body", "mass"] * 9.81
+        ratio = v["body", "mass_ratio"][self.load][:, None]
+        weight = s["friction"] * v["body", "mass"] * ratio * 9.81
         m = {k[1]: x for k, x in v.items() if k[0] == "motor"}
         turns = rim * pull / active
         rolled = v["surfaces", "roller_drag"][self.floor][:, None] * turns * np.abs(turns)

@@ -640,7 +640,7 @@ def test_damaged_results_are_refused_with_a_message(tmp_path):
     with pytest.raises(DataError, match="damaged"):
         load(tmp_path)
     (tmp_path / "fit.json").write_text('{"schema": "other/1"}')
-    with pytest.raises(DataError, match=r"its schema is other/1; expected slipid\.fit/8"):
+    with pytest.raises(DataError, match=r"its schema is other/1; expected slipid\.fit/9"):
         load(tmp_path)
     (tmp_path / "fit.json").write_text("{")
     with pytest.raises(DataError, match="not valid JSON"):

@@ -63,6 +63,14 @@ def test_each_of_two_sides_has_half_the_mass_and_twice_the_inertia_over_track_sq
     assert found["linear"].per_metre().kA.value == pytest.approx(linear / r)
 
 
+def test_a_load_accelerates_with_its_own_mass():
+    heavy = by_name(fitted_motors("skid", **{"mass_ratio@as_built": {"value": 1.3}}))
+    mass = 1.3 * number(fitted_motors("skid"), "robot.mass")
+    as_heavy = by_name(fitted_motors("skid", mass={"value": mass}))
+    assert heavy["linear"].kA.value == pytest.approx(as_heavy["linear"].kA.value)
+    assert heavy["angular"].kA == as_heavy["angular"].kA
+
+
 def test_inertias_that_nobody_knows_are_not_identified():
     found = by_name(fitted_motors("mecanum"))
     assert {g.verdict for g in (found["linear"].kS, found["linear"].kV)} == {"identified"}

@@ -49,13 +49,21 @@ def robot() -> DeployedRobot:
     made = eqx.tree_at(
         lambda r: (
             r.body.load_share,
+            r.body.mass_ratio,
             r.surfaces.friction,
             r.surfaces.drag_exponent,
             r.surfaces.knee_width,
             r.surfaces.load_bias,
         ),
         made,
-        (share, friction, jnp.asarray([1.0, 1.6]), jnp.asarray([0.3, 1.1]), biases),
+        (
+            share,
+            jnp.asarray([1.0, 1.3]),
+            friction,
+            jnp.asarray([1.0, 1.6]),
+            jnp.asarray([0.3, 1.1]),
+            biases,
+        ),
     )
     several = jax.tree.map(lambda x: jnp.broadcast_to(x, (5, *x.shape)), made)
     noise = np.random.default_rng(0).normal(size=(5, 2))
@@ -99,6 +107,7 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     first = DeployedRobot.load(path)
     assert first.load_setup == "own"
     np.testing.assert_array_equal(first.rest, [0.29, 0.44, 0.27])
+    assert float(again.mass) == 1.3 * float(first.mass)
     assert float(again.floors.friction[1]) == 0.1 + 0.2
     np.testing.assert_array_equal(again.floors.load_bias, [[0.1, -0.3, 0.2], [0.0, 1 / 3, -1 / 3]])
     np.testing.assert_array_equal(again.floors.drag_exponent, [1.0, 1.6])
@@ -212,9 +221,9 @@ def test_what_is_no_robot_is_refused(tmp_path):
 
 
 def test_a_newer_file_asks_for_an_update(path):
-    rewritten(path, lambda c: c.update(schema="slipid.robot/10", more=3))
+    rewritten(path, lambda c: c.update(schema="slipid.robot/99", more=3))
     message = refused(path)
-    assert "written by a newer slipid as slipid.robot/10" in message
+    assert "written by a newer slipid as slipid.robot/99" in message
     assert "update slipid" in message
 
 
@@ -356,7 +365,7 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c["draws"].update(mass=[1]), "'mass' is not a parameter"),
         (
             lambda c: c["units"].update(alike="m"),
-            "the units in this file differ from the units of slipid.robot/9",
+            "the units in this file differ from the units of slipid.robot/10",
         ),
         (
             lambda c: c.update(loads=c["loads"][:1] * 2),

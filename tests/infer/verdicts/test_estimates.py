@@ -38,6 +38,21 @@ def space_of(*patterns: str) -> Space:
     return Space(TRUTH, [NOTHING, *(Choice(p, free=True) for p in patterns)])
 
 
+def test_a_mass_ratio_is_free_but_for_the_first_load_setup_and_weak_at_most():
+    space = Space(TRUTH, [NOTHING, Choice("robot.load_share@moved", free=True)])
+    assert [e.path for e in space.free] == ["robot.load_share@moved"]
+    space = Space(TRUTH, [])
+    ratios = [e.path for e in space.free if e.quantity == "robot.mass_ratio"]
+    assert ratios == ["robot.mass_ratio@moved"]
+    assert space.electric[space.slices[ratios[0]]].all()
+    assert "robot.mass_ratio@as_built" in space_of("robot.mass_ratio@*").slices
+    narrow = np.diag(1e-4 * space.prior_std**2)
+    found = {e.path: e for e in estimates(space, (), space.start, narrow, True, ())}
+    assert found["robot.load_share@moved"].verdict == "identified"
+    assert found["robot.mass_ratio@moved"].verdict == "weak"
+    assert found["robot.mass_ratio@moved"].provenance == "measured"
+
+
 # sparse flat directions --------------------------------------------------------------------------
 
 
