@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.app.bench_priors import COPY_NAME
+from slipid.app.floor_maps import copy_maps
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask
 from slipid.data.runs import Runs
@@ -287,12 +288,13 @@ def read_calibration(out: Path) -> CalibrationFile:
 
 
 def write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:
-    """Write run.json, and copies of the config and the bench file, which later commands read."""
+    """Write run.json, and copies of config, maps and bench file, which later commands read."""
     config = task.config
     if (bench := config.content.wheels.motor) is not None:
         write_json(
             out / COPY_NAME, read_json(config.path.parent / bench, "the parameters of a motor")
         )
+    copy_maps(config, out)
     logs = {log.name: log.sha256 for log in task.logs}
     inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}
     verdict = {"trust": trust.to_json(), "seed": task.settings.seed}

@@ -20,7 +20,7 @@ from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise, start_rounds
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
-from slipid.infer.posterior.coordinates import Fitted
+from slipid.infer.posterior.coordinates import Fitted, around
 from slipid.infer.posterior.short_chain import short_chain
 from slipid.infer.result import Fit, required
 from slipid.infer.summary import summarise
@@ -312,11 +312,11 @@ def summarised(
 def with_chain(fit: Fit, settings: FitSection, report: Reporter) -> Fit:
     """Return the fit with the draws of a short chain, if the settings ask for them.
 
-    A fit that learnt from runs over several floors, or did not converge, stays as it is.
+    A fit that did not converge stays as it is.
     """
-    if settings.intervals != "sampled" or fit.mixed is not None or not fit.converged:
+    if settings.intervals != "sampled" or not fit.converged:
         return fit
-    chain = short_chain(required(fit.problem), Fitted.of(fit), settings.seed, report)
+    chain = short_chain(*around(required(fit.problem), Fitted.of(fit)), settings.seed, report)
     return replace(fit, chain=chain)
 
 

@@ -26,6 +26,7 @@ from slipid.app.config import (
     given_settings,
     single_floor_sections,
 )
+from slipid.app.floor_maps import map_files, map_path
 from slipid.app.logs import files_of, read_dataset
 from slipid.data.align.lag import pose_lag
 from slipid.data.check.columns import refuse_misordered
@@ -272,6 +273,7 @@ def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTa
     `root` is the data folder.
     """
     sections = [section for section in task.config.content.logs if section.map is not None]
+    map_files(task.config)
     found, absent = files_of(task.config, sections, root)
     for section, _ in found:
         floor = _map(task, section)
@@ -291,7 +293,8 @@ def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
     Raises:
         DataError: the map cannot be read, or has a floor on which there is no single-floor run.
     """
-    path = task.config.path.parent / str(section.map)
+    path = map_path(task.config, section)
+    assert path is not None, "the section has a map"
     floor = read_map(path)
     known = task.robot.surfaces.labels
     for name in floor.surfaces:

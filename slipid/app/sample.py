@@ -8,7 +8,8 @@ import numpy as np
 
 from slipid.app.config import read_config
 from slipid.app.logs import log_folder
-from slipid.app.problem import ConfigFitTask, read_fit_task
+from slipid.app.problem import ConfigFitTask, read_fit_task, with_mixed
+from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.infer.fit_file import load, write_identified
 from slipid.infer.posterior import sample as netcdf
 from slipid.infer.posterior.blocks import FORMAT, Plan
@@ -49,13 +50,17 @@ def sample(
     began = time.monotonic()
     setup_jax(quiet=True)
     fit = load(out)
-    _refuse_mixed(fit)
     folder = log_folder(out, data)
     task = read_fit_task(read_config(out / "config.toml"), folder, report)
     task = replace(task, choices=fit.choices)  # those of the calibration are not in the config
+    if fit.mixed is not None:
+        task = with_mixed(task, folder, report)
     _refuse_other_logs(fit, task)
     report.stage("compiling", usual_s=COMPILING_S)
-    fit = replace(fit, problem=task.problem(fit.robot), data=task.dataset)
+    problem = task.problem(fit.robot)
+    if fit.mixed is not None:
+        problem = problem.with_multi_floor(multi_floor_runs(task.mixed, fit.robot))
+    fit = replace(fit, problem=problem, data=task.dataset)
     # The key has everything that the draws depend on. The largest length of the chain is not part
     # of the key, so that a chain that ended at the limit can be continued with a larger limit.
     inputs = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
@@ -101,18 +106,10 @@ def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
     }
 
 
-def _refuse_mixed(fit: Fit) -> None:
-    """Raise `DataError` for a fit with runs over several floors, which cannot be sampled yet."""
-    if fit.mixed is not None:
-        raise DataError(
-            "the fit learnt from runs over several floors, which are not sampled yet; "
-            "expected a fit without the log sections that have a map (identify again without them)"
-        )
-
-
 def _refuse_other_logs(fit: Fit, task: ConfigFitTask) -> None:
     """Raise `DataError` about the first log that differs from the logs of the fit, if any does."""
-    then, now = dict(fit.runs), {log.name: log.sha256 for log in task.dataset.logs}
+    logs = task.dataset.logs if fit.mixed is None else task.logs
+    then, now = dict(fit.runs), {log.name: log.sha256 for log in logs}
     for name in [*then, *now]:
         if then.get(name) != now.get(name):
             what = "is missing" if name not in now else "is new" if name not in then else "changed"

@@ -226,6 +226,21 @@ def read_map(path: Path) -> FloorMap:
         raise DataError(f"{path}: {error}") from error
 
 
+def picture_of(path: Path) -> Path | None:
+    """Return the path of the picture that a map file refers to, None if there is no such file."""
+    if path.suffix.lower() == ".geojson":
+        return None
+    named = mapping_of(path, text_of(path, "a floor map")).get("picture")
+    found = _beside(path, named) if isinstance(named, str) else path.parent
+    return found if found.is_file() else None
+
+
+def _beside(path: Path, picture: str) -> Path:
+    """Return the path of a map's picture; a copied map has a copy of its picture beside it."""
+    named = path.parent / picture
+    return named if named.is_file() else path.parent / named.name
+
+
 def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
     """Write a map as a TOML file, and its picture as a PNG file of the same name beside it.
 
@@ -262,7 +277,7 @@ def _pictured(path: Path, given: PicturedFile) -> FloorMap:
     from matplotlib.colors import to_rgb
     from matplotlib.image import imread
 
-    source = path.parent / given.picture
+    source = _beside(path, given.picture)
     try:
         picture = np.asarray(imread(source), float)
     except (OSError, ValueError, SyntaxError) as error:

@@ -198,13 +198,16 @@ class MultiFloorBatch(eqx.Module):
 
     def residuals(self, robot: Robot, p: lk.Predicted) -> dict[str, Array]:
         """Return predicted less measured motion and, if they are logged, currents."""
+        motion = lk.motion_residual(robot, self.batch, p) * jnp.repeat(self.counts, 3, axis=1)
+        return {MULTI_FLOOR_MOTION: motion} | self.currents(robot, p.motor_force)
+
+    def currents(self, robot: Robot, motor_force: lk.MotorForce) -> dict[str, Array]:
+        """Return predicted less measured currents, given contact forces, if they are logged."""
         b = self.batch
-        motion = lk.motion_residual(robot, b, p)
-        out = {MULTI_FLOOR_MOTION: motion * jnp.repeat(self.counts, 3, axis=1)}
-        if b.has_current:
-            amps = lk.predicted_current(robot, b, p.motor_force) - b.current
-            out[MULTI_FLOOR_CURRENT] = (amps * self.counts[..., None]).reshape(len(motion), -1)
-        return out
+        if not b.has_current:
+            return {}
+        amps = lk.predicted_current(robot, b, motor_force) - b.current
+        return {MULTI_FLOOR_CURRENT: (amps * self.counts[..., None]).reshape(len(amps), -1)}
 
     def log_jacobian(self, robot: Robot) -> Float[Array, " segment"]:
         """Return log |d motion residuals / d logged poses| of every segment."""

@@ -122,8 +122,8 @@ class Problem:
         other._read(windows, self.multi_floor)
         return other
 
-    def with_multi_floor(self, multi_floor: MultiFloorRuns) -> "Problem":
-        """Return the same problem with runs over several floors."""
+    def with_multi_floor(self, multi_floor: MultiFloorRuns | None) -> "Problem":
+        """Return the same problem with other runs over several floors, or without any."""
         other = copy.copy(self)
         other.compiled = {}
         other._read(self.windows, multi_floor)

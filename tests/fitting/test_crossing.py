@@ -33,6 +33,8 @@ from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import Problem
 from slipid.fitting.variances import _cut, whitened
 from slipid.infer.fit_file import load
+from slipid.infer.posterior.coordinates import MOTION, Fitted, around
+from slipid.infer.posterior.density import Density
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.model import se2
 from slipid.report.html.evidence import read_evidence
@@ -219,6 +221,35 @@ def test_left_out_halves_are_predicted_down_to_the_noise(learnt):
     assert learnt.after.yaw_rate == pytest.approx(noise[1], rel=0.15)
     assert learnt.after.speed == pytest.approx(np.sqrt(2) * noise[0], rel=0.25)
     assert learnt.after.current == pytest.approx(np.hypot(CURRENT, OFFSET), rel=0.25)
+
+
+@pytest.mark.slow
+def test_the_sampled_density_has_the_mode_and_the_curvature_of_the_fit(learnt):
+    o = learnt.optimum
+    whole = Fitted(o.state.z, o.state.log_variance, o.covariance)
+    density = Density(*around(learnt.problem, whole), MOTION)
+    target, size, step = density.target(), density.size, 1e-3
+    assert [name for name in density.names if "friction" in name] == [
+        "surface.firm.friction",
+        "surface.soft.friction",
+    ]
+    std = np.sqrt(np.diag(density.covariance))
+    off = step * np.concatenate([np.diag(std), -np.diag(std)])
+    values = target.log_prob(density.centre + off)[:, 0]
+    slope = (values[:size] - values[size:]) / (2 * step)
+    # The Student t has its factor of information for each block, so that modes differ a little.
+    assert np.abs(slope).max() < 0.3
+    assert np.abs(slope[:2]).max() < 0.01  # of friction
+    information = np.diag(1 / target.prior_std**2) + target.link.T @ target.link
+    for group in range(target.groups):
+        y, _ = target.rows(density.centre + off, group)
+        half = (y[:size] - y[size:]) / (2 * step * std[:, None])
+        information += half @ half.T
+    found = np.linalg.inv(information)
+    own = np.sqrt(np.diag(found))
+    np.testing.assert_allclose(own, std, rtol=0.12)
+    correlation = density.covariance / np.outer(std, std)
+    np.testing.assert_allclose(found / np.outer(own, own), correlation, atol=0.05)
 
 
 @pytest.mark.slow
@@ -591,9 +622,12 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     judged = invoke("validate", out, "--data", tmp_path / "logs", "--json", tmp_path / "v.json")
     assert judged.exit_code == 0, judged.stderr
     assert len(json.loads((tmp_path / "v.json").read_text())["runs"]) == 12
-    drawn = invoke("sample", out)
-    assert drawn.exit_code == 2
-    assert "runs over several floors, which are not sampled yet" in drawn.stderr
+    (tmp_path / "site.toml").unlink()  # the folder of the results has a copy
+    drawn = invoke("sample", out, "--most", 40, "--draws", 10)
+    assert drawn.exit_code == 1, drawn.stderr  # so few steps are not converged
+    about = json.loads((out / "sample.json").read_text())
+    assert about["worst"]["r_hat"] < 1.5
+    assert "surface.soft.friction" not in about["coordinates"]  # nothing moves by its friction
     deployed(out)
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from slipid.app.calibrate import read_calibration
 from slipid.app.config import Config, LogsSection, read_config
+from slipid.app.floor_maps import map_path
 from slipid.app.logs import matching_files, read_dataset
 from slipid.app.problem import shape_of
 from slipid.data.floor_map import FloorMap, read_map
@@ -263,9 +264,9 @@ def _floor(
     """Return the map of the floor, and a sentence if the config's map is missing."""
     if given is not None:
         return read_map(given), []
-    if section.map is None:
+    path = map_path(config, section)
+    if path is None:
         return None, []
-    path = config.path.parent / section.map
     if path.is_file():
         return read_map(path), []
     return None, [f"{path}: no such floor map; name it by --map"]

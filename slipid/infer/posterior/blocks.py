@@ -32,7 +32,8 @@ class LogDensity:
 
     There is one term per group of coordinates, then a term of the coordinates that groups share,
     which is their log prior. The term of a group is c - |y|^2 / 2 plus the log prior of its own
-    coordinates, with whitened residuals y and a remainder c.
+    coordinates, with whitened residuals y and a remainder c. The log prior is that of `prior_mean`
+    and `prior_std`, and -|link (x - link_centre)|^2 / 2 in the term of the shared coordinates.
 
     Attributes:
         names: name of each coordinate.
@@ -43,6 +44,9 @@ class LogDensity:
         positive: True for coordinates that are logarithms of positive parameters.
         prior_mean, prior_std: mean and std of the Gaussian prior; the std is infinite without one.
         centre, covariance: mean and covariance of the Laplace approximation.
+        link: whitened residuals of a Gaussian prior that connects shared coordinates, per change
+            of every coordinate.
+        link_centre: vector at which they are zero.
         quotients: pairs of logarithms of which the residuals depend on the difference alone where
             both are large.
     """
@@ -57,6 +61,8 @@ class LogDensity:
     prior_std: Float[np.ndarray, " size"]
     centre: Float[np.ndarray, " size"]
     covariance: Matrix
+    link: Matrix
+    link_centre: Float[np.ndarray, " size"]
     quotients: tuple[tuple[int, int], ...] = ()
 
     @property

@@ -14,6 +14,7 @@ from slipid.fitting import likelihood as lk
 from slipid.fitting.problem import Problem, effects_given, twists
 from slipid.fitting.shared_effects import EffectPosterior, SharedEffects
 from slipid.fitting.variances import DEGREES, Blocks, Square, Vector, expected, inverse_root
+from slipid.infer.posterior.multi_floor_anchor import MultiFloorAnchor
 from slipid.infer.result import Fit, required
 from slipid.model.robot import Robot
 
@@ -35,11 +36,13 @@ class Fitted:
         log_variance: log variances in the order of the problem's components.
         covariance: Laplace covariance with shared effects marginalised; if currents were logged,
             the covariance of p(electric | motion, data) p(motion | motion data).
+        multi_floor: runs over several floors; None without such runs.
     """
 
     z: np.ndarray
     log_variance: np.ndarray
     covariance: Square
+    multi_floor: MultiFloorAnchor | None = None
 
     @classmethod
     def of(cls, fit: Fit) -> "Fitted":
@@ -48,18 +51,32 @@ class Fitted:
         return cls(fit.z, np.log([fit.variance[name] for name in names]), fit.covariance)
 
 
+def around(problem: Problem, fitted: Fitted) -> tuple[Problem, Fitted]:
+    """Return the problem of the runs on one floor each, and the fitted values for it.
+
+    The runs over several floors, if the problem has some, are in `Fitted.multi_floor`.
+    """
+    if problem.multi_floor is None:
+        return problem, fitted
+    alone = problem.with_multi_floor(None)
+    kept = [problem.noise.names.index(name) for name in alone.noise.names]
+    several = MultiFloorAnchor.at(problem, fitted.z, fitted.log_variance)
+    return alone, replace(fitted, log_variance=fitted.log_variance[kept], multi_floor=several)
+
+
 class Coordinates(NamedTuple):
     """Coordinates of a part of the posterior.
 
     Attributes:
         structure: index of each coordinate in the search vector.
         group: index of the only floor whose residuals depend on it, -1 if there are several.
-        touched: True where the residuals of a floor depend on a coordinate.
+        touched: True where the residuals of a floor depend on a coordinate; with runs over several
+            floors, the last row is that of these runs.
     """
 
     structure: Int[np.ndarray, " size"]
     group: Int[np.ndarray, " size"]
-    touched: Bool[np.ndarray, "floor size"]
+    touched: Bool[np.ndarray, "group size"]
 
 
 def coordinates(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
@@ -67,6 +84,8 @@ def coordinates(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
 
     The group is the index of the only floor whose residuals depend on the coordinate, -1 if several
     floors or none depend on it; if the robot has one floor only, all coordinates are in group 0.
+    With runs over several floors no coordinate has a group, and the friction that moves these runs
+    belongs to the motion.
     The Jacobian at the fit shows which floors each coordinate affects.
     """
     _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
@@ -78,7 +97,14 @@ def coordinates(problem: Problem, fitted: Fitted, part: str) -> Coordinates:
             for floor in range(touched.shape[1]):
                 touched[:, floor] |= moved[surface == floor].any(axis=0)
     electric = problem.space.electric
+    if fitted.multi_floor is not None:
+        electric = electric.copy()
+        electric[np.asarray(fitted.multi_floor.friction)] = False
     mine = {MOTION: ~electric, ELECTRIC: electric, EVERYTHING: np.ones_like(electric)}[part]
+    if fitted.multi_floor is not None and part != ELECTRIC:
+        touched = np.column_stack([touched, np.asarray(fitted.multi_floor.moved)])
+        none = np.full(mine.sum(), -1)
+        return Coordinates(np.flatnonzero(mine), none, touched[mine].T)
     alone = (touched.sum(axis=1) == 1) | (touched.shape[1] == 1)
     group = np.where(alone, touched.argmax(axis=1), -1)[mine]
     return Coordinates(np.flatnonzero(mine), group, touched[mine].T)
@@ -101,7 +127,8 @@ class Anchor(eqx.Module):
     Attributes:
         batch: the windows.
         z: search vector of the fit.
-        prior_std: prior std of every coordinate.
+        prior_std: prior std of every coordinate; infinite for friction that `multi_floor` links to
+            the motion.
         root: whitening matrices of every block, for the noise variances of the fit.
         scale: square root of the weight of each segment, small for an outlier.
         log_det: log determinant of each segment's noise covariance.
@@ -110,6 +137,7 @@ class Anchor(eqx.Module):
         twist: twist of every window at the fit.
         twist_slope: derivative of the twists with respect to the search vector.
         electric: noise that predictions of voltages depend on, with the fitted resistance.
+        multi_floor: runs over several floors; None without such runs.
     """
 
     batch: lk.Batch
@@ -123,6 +151,7 @@ class Anchor(eqx.Module):
     twist: Float[Array, "segment window 3"]
     twist_slope: Float[Array, "segment window 3 free"]
     electric: lk.ElectricNoise
+    multi_floor: MultiFloorAnchor | None
 
     @staticmethod
     def at(problem: Problem, fitted: Fitted) -> "Anchor":
@@ -141,11 +170,14 @@ class Anchor(eqx.Module):
         plain = {k: inverse_root(c.covariance(log_v)) for k, c in problem.noise.blocks.items()}
         diagonal = {k: jnp.diagonal(r, axis1=-2, axis2=-1) for k, r in plain.items()}
         twist, slope = twists(problem.space, problem.batch, fitted.z)
+        prior_std = problem.objective.prior_std(log_v)
+        if fitted.multi_floor is not None:  # its link to the motion contains the prior of friction
+            prior_std = prior_std.at[fitted.multi_floor.friction].set(jnp.inf)
         weight = weighed.whitening.weight
         return Anchor(
             batch=problem.batch,
             z=jnp.asarray(fitted.z),
-            prior_std=problem.objective.prior_std(log_v),
+            prior_std=prior_std,
             root=plain,
             scale={k: jnp.sqrt(w * part[k] / part["motion"]) for k, w in weight.items()},
             log_det={k: -2 * jnp.sum(jnp.log(d), axis=-1) for k, d in diagonal.items()},
@@ -154,6 +186,7 @@ class Anchor(eqx.Module):
             twist=twist,
             twist_slope=slope,
             electric=electric,
+            multi_floor=fitted.multi_floor,
         )
 
     def on_floor(self, floor: int) -> "Anchor":
@@ -179,6 +212,7 @@ class Anchor(eqx.Module):
             twist=self.twist[mine],
             twist_slope=self.twist_slope[mine],
             electric=replace(self.electric, scatter=rows(self.electric.scatter)),
+            multi_floor=None,
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:

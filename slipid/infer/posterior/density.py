@@ -31,11 +31,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.fitting import likelihood as lk
+from slipid.fitting.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION
 from slipid.fitting.problem import Problem
 from slipid.fitting.shared_effects import marginal_residuals, mean_effects
 from slipid.fitting.variances import Square, expected
 from slipid.infer.posterior.blocks import LogDensity
-from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Fitted, coordinates
+from slipid.infer.posterior.coordinates import (
+    ELECTRIC,
+    EVERYTHING,
+    MOTION,
+    Anchor,
+    Fitted,
+    coordinates,
+)
 from slipid.model.robot import Robot
 
 Result = TypeVar("Result")
@@ -47,10 +55,12 @@ class HeldMotion(NamedTuple):
     Attributes:
         z: search vector with the walker's parameters of the motion.
         motor_force: contact forces that the motors work against [mu m g].
+        multi_floor: these forces in runs over several floors; None without such runs.
     """
 
     z: Float[Array, "*walker free"]
     motor_force: Float[Array, "*walker segment window wheel 2"]
+    multi_floor: Float[Array, "*walker segment window wheel 2"] | None
 
 
 class WhitenedResiduals(NamedTuple):
@@ -81,8 +91,9 @@ class Density:
     Attributes:
         structure: index of each coordinate in the search vector.
         group: index of the only floor whose residuals depend on the coordinate, -1 if there are
-            several.
-        touched: True where the residuals of a floor depend on a coordinate (floor, size).
+            several, or if there are runs over several floors.
+        touched: True where the residuals of a floor depend on a coordinate (floor, size); the last
+            row is that of runs over several floors, if there are any.
         names: name of each coordinate.
         centre, covariance: mean and covariance of the Laplace approximation.
     """
@@ -98,6 +109,10 @@ class Density:
         form = part, self.names, self.group.tobytes()
         self._each: dict[Callable[..., object], Callable[..., Any]] = {}
         self._form: Density = problem.compiled.setdefault(form, self)
+        self._link, self._link_centre = np.zeros((0, self.size)), np.zeros(self.size)
+        if fitted.multi_floor is not None and part == MOTION:
+            self._link = np.asarray(fitted.multi_floor.link)[:, self.structure]
+            self._link_centre = np.asarray(fitted.multi_floor.link_centre)[self.structure]
         self.centre = fitted.z[self.structure]
         self.covariance = fitted.covariance[np.ix_(self.structure, self.structure)]
 
@@ -134,18 +149,20 @@ class Density:
     def target(self) -> LogDensity:
         """Return the density as the sampler needs it."""
         space, at = self.problem.space, self.structure
-        floors = np.arange(len(self.floors))[:, None]
+        groups = np.arange(len(self.touched))[:, None]
         return LogDensity(
             names=self.names,
             terms=self.terms,
             rows=self.rows,
-            depends=self.touched | (self.group == floors),
+            depends=self.touched | (self.group == groups),
             group=self.group,
             positive=space.where(lambda e: e.declaration.logarithmic)[at],
             prior_mean=space.prior_mean[at],
             prior_std=np.asarray(self.anchor.prior_std)[at],
             centre=self.centre,
             covariance=self.covariance,
+            link=self._link,
+            link_centre=self._link_centre,
             quotients=self._quotients(),
         )
 
@@ -157,31 +174,35 @@ class Density:
         return tuple((place[a], place[b]) for a, b in pairs if b in place)
 
     def terms(self, x: Float[np.ndarray, "walker size"]) -> Float[np.ndarray, "walker term"]:
-        """Return the terms of every walker's log posterior: one per floor, then the shared term.
+        """Return the terms of every walker's log posterior: one per group, then the shared term.
 
-        The electric part has no terms, since it depends on the motion of each walker (`log_prob`).
+        A group is a floor, or all runs over several floors. The electric part has no terms, since
+        it depends on the motion of each walker (`log_prob`).
         """
-        out = np.zeros((len(x), len(self.floors) + 1))
+        out = np.zeros((len(x), len(self.touched) + 1))
         prior = -0.5 * np.asarray(self._pull(self.anchor, x)) ** 2
         np.add.at(out.T, self.group, prior.T)  # group -1 is the last term
-        for floor in range(len(self.floors)):
-            y, remainder = self.rows(x, floor)
-            out[:, floor] += remainder - 0.5 * (y**2).sum(axis=1)
+        out[:, -1] -= 0.5 * (((x - self._link_centre) @ self._link.T) ** 2).sum(axis=1)
+        for group in range(len(self.touched)):
+            y, remainder = self.rows(x, group)
+            out[:, group] += remainder - 0.5 * (y**2).sum(axis=1)
         out[~np.isfinite(out)] = -np.inf
         return out
 
     def rows(
-        self, x: Float[np.ndarray, "walker size"], floor: int
+        self, x: Float[np.ndarray, "walker size"], group: int
     ) -> tuple[Float[np.ndarray, "walker row"], Float[np.ndarray, " walker"]]:
-        """Return whitened residuals y of a floor and the remainder c of its log likelihood.
+        """Return whitened residuals y of a group and the remainder c of its log likelihood.
 
         The log likelihood is c - |y|^2 / 2.
         """
+        of_floor = group < len(self.floors)
+        of, floor = (Density.whitened, group) if of_floor else (Density.over_several, None)
         y, c = [], []
         # Batches of one size only, so that one compiled function serves any number of walkers.
         for k in range(0, len(x), _BATCH):
             some = np.minimum(np.arange(k, k + _BATCH), len(x) - 1)
-            found = self.mapped(Density.whitened, x[some], None, floor=floor)
+            found = self.mapped(of, x[some], None, floor=floor)
             y.append(np.asarray(found.rows)[: len(x) - k])
             c.append(np.asarray(found.remainder)[: len(x) - k])
         return np.concatenate(y), np.concatenate(c)
@@ -198,6 +219,9 @@ class Density:
         camera, spread = lk.log_jacobians(found.robot, b, anchor.noise(found.robot))
         rows, remainder = [], jnp.zeros(())
         for k, r in found.residuals.items():
+            if k == MULTI_FLOOR_CURRENT and anchor.multi_floor is not None:
+                rows.append(anchor.multi_floor.white(k, r).ravel())
+                continue
             white = anchor.white(k, r)
             # The factor f makes the mode equal to that of the fit.
             f = expected(r.shape[-1])
@@ -208,6 +232,15 @@ class Density:
                 rows.append(white.ravel())
                 remainder += f * jnp.sum(spread) if k == "voltage" else 0.0
         return WhitenedResiduals(jnp.concatenate(rows), remainder)
+
+    def over_several(self, anchor: Anchor, x: Array, _: HeldMotion | None) -> WhitenedResiduals:
+        """Return whitened motion residuals of runs over several floors, for one vector."""
+        z, runs = self.full(anchor, x), anchor.multi_floor
+        assert runs is not None, "the density has runs over several floors"
+        robot = self.problem.space.tree(z)
+        r = runs.runs.residuals(robot, runs.predict(robot, z - anchor.z))[MULTI_FLOOR_MOTION]
+        remainder = jnp.sum(runs.factor * runs.runs.log_jacobian(robot))
+        return WhitenedResiduals(runs.white(MULTI_FLOOR_MOTION, r).ravel(), remainder)
 
     def _pull(self, anchor: Anchor, x: Array | np.ndarray) -> Float[Array, "*walker size"]:
         """Return the residuals of the prior [prior std]."""
@@ -237,9 +270,10 @@ class Density:
         if self.part == ELECTRIC:
             assert held is not None, "the electric part needs the motion of each walker"
             robot = self.problem.space.tree(held.z.at[self.structure].set(x))
-            return _Residuals(
-                lk.electric_residuals(robot, b, held.motor_force, anchor.noise(robot)), robot
-            )
+            out = lk.electric_residuals(robot, b, held.motor_force, anchor.noise(robot))
+            if anchor.multi_floor is not None and held.multi_floor is not None:
+                out |= anchor.multi_floor.runs.currents(robot, held.multi_floor)
+            return _Residuals(out, robot)
         z = self.full(anchor, x)
         robot = self.problem.space.tree(z)
         p = anchor.predict(robot, z)
@@ -254,8 +288,11 @@ class Density:
         return self.mapped(Density._held, x, None)
 
     def _held(self, anchor: Anchor, x: Array, _: None) -> HeldMotion:
-        z = self.full(anchor, x)
-        return HeldMotion(z, anchor.predict(self.problem.space.tree(z), z).motor_force)
+        z, runs = self.full(anchor, x), anchor.multi_floor
+        robot, more = self.problem.space.tree(z), None
+        if runs is not None:
+            more = runs.predict(robot, z - anchor.z).motor_force
+        return HeldMotion(z, anchor.predict(robot, z).motor_force, more)
 
 
 _BATCH = 4

@@ -100,9 +100,8 @@ class Learner:
     ) -> Learnt:
         """Return the surrogate fitted to a design, to which draws of the surrogate are added."""
         target, plan = self.target, self.plan
-        surrogate = Surrogate(
-            self._fitted(design), target.group, target.prior_mean, target.prior_std, *frame
-        )
+        prior = target.prior_mean, target.prior_std, target.link, target.link_centre
+        surrogate = Surrogate(self._fitted(design), target.group, *prior, *frame)
         x, step, drawn = start, step.copy(), []
         calls = -(-plan.rows // (ROUNDS * plan.ensembles * plan.walkers))
         of_family = families(target)

@@ -4,7 +4,8 @@ Where currents were logged the posterior is p(motion | motion data) p(electric |
 density cannot be evaluated, since the normalising constant of the second factor depends on the
 motion. Therefore the motion is sampled first. Given the motion, the residuals are nearly linear in
 the electric parameters, which are drawn by Metropolis-Hastings steps with proposals around their
-most likely values.
+most likely values. The friction that moves runs over several floors is sampled with the motion
+(`slipid.infer.posterior.multi_floor_anchor`).
 """
 
 import tempfile
@@ -24,7 +25,7 @@ from slipid.fitting.problem import Problem
 from slipid.fitting.variances import DEGREES
 from slipid.infer.posterior import diagnosis, ensemble
 from slipid.infer.posterior.blocks import Chain, ChainBlock, Plan
-from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
+from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, around
 from slipid.infer.posterior.density import (
     LEAST_ACCEPTED,
     MOST_REFUSED,
@@ -49,8 +50,7 @@ def sampled(
 
     Sampling resumes after the blocks that an earlier call has stored in the checkpoint.
     """
-    problem, fitted = required(fit.problem), Fitted.of(fit)
-    assert problem.multi_floor is None, "sampling needs a fit of runs on one floor each"
+    problem, fitted = around(required(fit.problem), Fitted.of(fit))
     parts = (EVERYTHING,) if problem.objective.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     blocks = ensemble.extended(first.target(), plan, parts[0], checkpoint, report)
@@ -86,7 +86,7 @@ def sampled(
     return Posterior(
         fit=fit,
         z=out,
-        log_variance=log_variance,
+        log_variance=_of_all(fit, problem, log_variance),
         log_prob=log_prob,
         names=first.names,
         diagnosis=found,
@@ -94,6 +94,16 @@ def sampled(
         converged=found.converged and few <= MOST_REFUSED,
         reason=reason,
     )
+
+
+def _of_all(
+    fit: Fit, alone: Problem, drawn: Float[np.ndarray, "ensemble draw variance"]
+) -> Float[np.ndarray, "ensemble draw variance"]:
+    """Return draws of all log variances; those of runs over several floors stay as fitted."""
+    names, fitted = required(fit.problem).noise.names, Fitted.of(fit).log_variance
+    out = np.broadcast_to(fitted, (*drawn.shape[:2], len(names))).copy()
+    out[..., [names.index(name) for name in alone.noise.names]] = drawn
+    return out
 
 
 def thinned(
@@ -119,17 +129,19 @@ _AXES = ("x", "y", "yaw")
 def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
     """Return the content of posterior.nc; `about` holds further attributes of the file."""
     fit, problem = found.fit, required(found.fit.problem)
+    alone, fitted = around(required(fit.problem), Fitted.of(fit))
     w, robot, runs = problem.windows, problem.robot, [name for name, _ in fit.runs]
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)
     x = found.z
-    density = Density(problem, replace(Fitted.of(fit), z=x.mean(axis=(0, 1))), EVERYTHING)
+    fitted = replace(fitted, z=x.mean(axis=(0, 1)), multi_floor=None)
+    density = Density(alone, fitted, EVERYTHING)
     per_segment = log_likelihoods(density, x, np.asarray(w.run))
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
-    measured, predicted, data_dims = _data(
-        problem, found, _replicates(density, x, found.log_variance)
-    )
+    kept = [problem.noise.names.index(name) for name in alone.noise.names]
+    new = _replicates(density, x, found.log_variance[..., kept])
+    measured, predicted, data_dims = _data(problem, found, new)
     coords = {
         "surface": list(robot.surfaces.labels),
         "load": list(robot.body.loads),

@@ -146,7 +146,7 @@ class Surrogate(NamedTuple):
     Attributes:
         groups: surrogate of every group.
         group: group of every coordinate, -1 for coordinates that groups share.
-        prior_mean, prior_std: Gaussian prior of every coordinate.
+        prior_mean, prior_std, link, link_centre: Gaussian prior, as in `blocks.LogDensity`.
         centre: mean of the Gaussian.
         root: square root of its covariance. A coordinate of a group depends on the standard
             coordinates of its own group and on those that groups share, not on those of others.
@@ -156,6 +156,8 @@ class Surrogate(NamedTuple):
     group: Int[np.ndarray, " size"]
     prior_mean: Float[np.ndarray, " size"]
     prior_std: Float[np.ndarray, " size"]
+    link: Matrix
+    link_centre: Float[np.ndarray, " size"]
     centre: Float[np.ndarray, " size"]
     root: Matrix
 
@@ -169,7 +171,10 @@ class Surrogate(NamedTuple):
         of_groups = [g.with_slope(x, bounded) for g in self.groups]
         terms = -0.5 * pull**2 @ own.astype(float)
         terms = terms.at[:, :-1].add(jnp.stack([of.value for of in of_groups], axis=1))
-        return ValueAndSlope(terms, sum((of.slope for of in of_groups), -pull / self.prior_std))
+        linked = (x - self.link_centre) @ self.link.T
+        terms = terms.at[:, -1].add(-0.5 * jnp.sum(linked**2, axis=1))
+        of_prior = -pull / self.prior_std - linked @ self.link
+        return ValueAndSlope(terms, sum((of.slope for of in of_groups), of_prior))
 
     @staticmethod
     def of_leaves(leaves: Sequence[np.ndarray], groups: int) -> "Surrogate":

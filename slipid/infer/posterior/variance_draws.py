@@ -102,6 +102,7 @@ def added_covariance(
 ) -> Square:
     """Return the covariance that uncertain variances add to that of the parameters of the motion.
 
+    With runs over several floors, the friction that moves them is one of these parameters.
     With variances v that are drawn, the covariance is E[cov | v] + Cov(mean | v); the covariance at
     the fitted variances is subtracted. Negative eigenvalues of the difference, relative to that
     covariance, are set to zero.
@@ -118,8 +119,10 @@ def added_covariance(
     before, found = given(fitted.log_variance).covariance, [given(log_v) for log_v in some]
     between = np.cov([x.mean for x in found], rowvar=False)
     excess = np.mean([x.covariance for x in found], axis=0) + between - before
-    joint, out = problem.objective.joint, np.zeros_like(before)
-    mine = np.ix_(*[np.flatnonzero(~problem.space.electric | joint)] * 2)
+    out, of_motion = np.zeros_like(before), ~problem.space.electric | problem.objective.joint
+    if fitted.multi_floor is not None:
+        of_motion[np.asarray(fitted.multi_floor.friction)] = True
+    mine = np.ix_(*[np.flatnonzero(of_motion)] * 2)
     root = np.linalg.cholesky(before[mine])
     value, vector = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, excess[mine]).T))
     out[mine] = (root @ vector * np.maximum(value, 0.0)) @ (root @ vector).T

@@ -135,7 +135,8 @@ def linear_parts(problem: Problem, fitted: Fitted) -> tuple[LinearPart, ...]:
     """Return the part of motion residuals, and that of currents and voltages if they are logged.
 
     As in the fit, currents do not inform about parameters of the motion. In their part, these are
-    drawn from the posterior given the motion.
+    drawn from the posterior given the motion. Runs over several floors are a Gaussian of the
+    parameters, with their variances as fitted.
     """
     objective, z, log_v = problem.objective, fitted.z, fitted.log_variance
     noises, electric = problem.noise.blocks, problem.electric(fitted.z, fitted.log_variance)
@@ -145,11 +146,17 @@ def linear_parts(problem: Problem, fitted: Fitted) -> tuple[LinearPart, ...]:
     slope = np.asarray(log_jacobian(objective, z, electric, problem.full_weight)[1])
     e = problem.space.electric
     pull = precision @ (problem.space.prior_mean - z) + slope
+    whole, whole_pull, several = precision.copy(), pull.copy(), fitted.multi_floor
+    if several is not None:
+        linked = np.asarray(several.friction)
+        whole[linked, linked], whole_pull[linked] = 0.0, 0.0
+        whole += np.asarray(several.information)
+        whole_pull += np.asarray(several.pull)
     motion = LinearPart(
         {"motion": noises["motion"]},
         {"motion": rows["motion"]},
-        precision,
-        pull,
+        whole,
+        whole_pull,
         np.zeros_like(precision),
         objective.shared,
         np.asarray(objective.typical),
@@ -162,6 +169,7 @@ def linear_parts(problem: Problem, fitted: Fitted) -> tuple[LinearPart, ...]:
         motion,
         noises={k: noises[k] for k in rows if k != "motion"},
         rows={k: rows[k] for k in rows if k != "motion"},
+        precision=precision,
         pull=np.where(e, pull, 0.0),
         given=given,
         shared=(),
