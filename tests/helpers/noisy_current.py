@@ -58,9 +58,14 @@ def truth():
             r.motor.coulomb_friction,
             r.motor.viscous_friction,
             r.surfaces.friction,
+            r.body.mass_ratio,
         ),
         blank,
-        (*(jnp.asarray(x) for x in (*MOTOR.values(), 0.01, 0.002)), jnp.full(2, MU)),
+        (
+            *(jnp.asarray(x) for x in (*MOTOR.values(), 0.01, 0.002)),
+            jnp.full(2, MU),
+            jnp.ones(2),
+        ),
     )
 
 

@@ -35,7 +35,7 @@ from slipid.infer.posterior.density import (
 )
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.posterior.left_out import log_likelihoods
-from slipid.infer.posterior.variance_draws import added_covariance, drawn_variances
+from slipid.infer.posterior.variance_draws import added_covariance, drawn_variances, widened
 from slipid.infer.result import Fit, required
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
@@ -62,8 +62,7 @@ def sampled(
     log_variance = drawn_variances(problem, fitted, shape, plan.seed)
     # The chain has the variances of the fit; their uncertainty adds to that of the parameters.
     added = added_covariance(problem, fitted, log_variance)[np.ix_(*[first.structure] * 2)]
-    rng = np.random.default_rng([plan.seed, 2])
-    x = x + rng.multivariate_normal(np.zeros(first.size), added, shape, method="eigh")
+    x = widened(x, added, plan.seed)
     out = np.broadcast_to(fitted.z, (*shape, len(fitted.z))).copy()
     out[..., first.structure] = x
     accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}

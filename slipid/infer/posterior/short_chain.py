@@ -1,7 +1,8 @@
 """Short chain around a fit, for the intervals that its Laplace approximation does not describe.
 
 The chain is that of `slipid.infer.posterior.ensemble` with fewer rows, walkers and blocks. The ends
-of its intervals have sampling errors of .1 to .2 standard deviations.
+of its intervals have sampling errors of about .1 standard deviations. As in `slipid sample`, the
+uncertainty of the variances of the noise is added to its draws.
 """
 
 from dataclasses import replace
@@ -18,10 +19,16 @@ from slipid.infer.posterior.density import (
     electric_given_motion,
     refused,
 )
+from slipid.infer.posterior.variance_draws import (
+    CONDITIONED,
+    added_covariance,
+    drawn_variances,
+    widened,
+)
 from slipid.infer.verdicts.draws import Draws
 from slipid.support.progress import Reporter
 
-SHORT = Plan(ensembles=2, walkers=32, block=8, warm_up=(1, 2), most=5, rows=800, spread=1.0)
+SHORT = Plan(ensembles=2, walkers=32, block=16, warm_up=(1, 2), most=5, rows=1200, spread=1.0)
 """Settings of the sampler: the surrogate is learnt twice, and three blocks are kept.
 
 With four, `ensemble` would judge their convergence, for which it needs packages of an extra."""
@@ -63,6 +70,9 @@ def _drawn(first: Density, fitted: Fitted, seed: int, report: Reporter) -> Draws
     x = ensemble.chain(blocks, plan)[:, ::THINNED]
     ensembles, steps, walkers, size = x.shape
     x = x.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, size)
+    log_variance = drawn_variances(problem, fitted, (1, CONDITIONED), seed, of_motion=True)
+    added = added_covariance(problem, fitted, log_variance)[np.ix_(*[first.structure] * 2)]
+    x = widened(x, added, seed)
     z = np.broadcast_to(fitted.z, (*x.shape[:2], len(fitted.z))).copy()
     z[..., first.structure] = x
     if problem.objective.joint or not (second := Density(problem, fitted, ELECTRIC)).size:

@@ -68,25 +68,26 @@ _PATH, _MOST_LEAPS = (1.0, 4.0), 16
 the largest number of leapfrog steps of a move."""
 _STEP = 2.0
 """Width of a step outwards in the log variance of a shared effect."""
-_CONDITIONED = 120
+CONDITIONED = 120
 """Number of draws of the variances given which covariances are computed."""
 _LEAST_EIGENVALUE = 1e-9
 """Part of the largest eigenvalue of the kernel over driving conditions below which others are 0."""
 
 
 def drawn_variances(
-    problem: Problem, fitted: Fitted, shape: tuple[int, int], seed: int
+    problem: Problem, fitted: Fitted, shape: tuple[int, int], seed: int, of_motion: bool = False
 ) -> Float[np.ndarray, "ensemble draw variance"]:
     """Return draws of the log variances, from a chain for each ensemble.
 
     Draws are spread evenly over the sweeps of a chain; if there are more draws than sweeps, some
     sweeps count several times. The variance of the load biases is drawn from its evidence on a
-    grid, at the fitted values of all other variances.
+    grid, at the fitted values of all other variances. With `of_motion`, the variances of currents
+    and voltages stay as fitted.
     """
     rng, log_v = np.random.default_rng([seed, 1]), fitted.log_variance
     out = np.broadcast_to(log_v, (*shape, len(log_v))).copy()
     spread = (np.arange(shape[1]) + 0.5) / shape[1]
-    for part in linear_parts(problem, fitted):
+    for part in linear_parts(problem, fitted)[: 1 if of_motion else None]:
         number = int(np.clip(_WORK / part.elements, *_SWEEPS))
         first = int(_WARM_UP * number)
         found = islice(sweeps(part, log_v, shape[0], first, rng), first, first + number)
@@ -95,6 +96,15 @@ def drawn_variances(
     pooled = pooled_stds(np.linalg.inv(fitted.covariance), fitted.z, problem.objective, log_v)
     out[..., problem.objective.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
     return out
+
+
+def widened(
+    x: Float[np.ndarray, "ensemble draw size"], added: Square, seed: int
+) -> Float[np.ndarray, "ensemble draw size"]:
+    """Return draws at fitted variances, to which the covariance is added that these add."""
+    rng = np.random.default_rng([seed, 2])
+    mean = np.zeros(x.shape[-1])
+    return x + rng.multivariate_normal(mean, added, x.shape[:2], method="eigh")
 
 
 def added_covariance(
@@ -110,7 +120,7 @@ def added_covariance(
     """
     part = linear_parts(problem, fitted)[0]
     some = draws.reshape(-1, draws.shape[-1])
-    some = some[np.linspace(0, len(some) - 1, _CONDITIONED).astype(int)]
+    some = some[np.linspace(0, len(some) - 1, CONDITIONED).astype(int)]
     floors, at = floor_runs(part), weights_at(problem, fitted)
 
     def given(log_v: Variances) -> Conditional:

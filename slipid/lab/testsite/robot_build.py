@@ -134,6 +134,10 @@ class RobotBuild(ABC):
         wheels = self.support_share(load)[: len(self.places)]
         return wheels / wheels.sum()
 
+    def wheels_part(self, load: str) -> float:
+        """Return the fraction of the weight that the wheels carry together."""
+        return float(self.support_share(load)[: len(self.places)].sum())
+
     def support_share(self, load: str) -> Float[np.ndarray, " support"]:
         """Return the fraction of the weight on each support, from static equilibrium.
 

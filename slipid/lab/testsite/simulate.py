@@ -291,6 +291,10 @@ def truth(site: Site) -> dict[str, Content]:
         f"robot.load_share@{load}": (robot.load_share(load).tolist(), "1")
         for load in robot.centres_m
     }
+    first, *others = sorted(robot.centres_m)
+    for load in others:  # torques are those of the weight that wheels carry, without a castor's
+        ratio = robot.wheels_part(load) / robot.wheels_part(first)
+        found[f"robot.mass_ratio@{load}"] = (ratio, "1")
     found |= {
         "motor.resistance": (motor.resistance_ohm, "ohm"),
         "motor.back_emf": (motor.back_emf_vs, "V*s/rad"),
