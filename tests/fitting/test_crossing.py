@@ -35,6 +35,8 @@ from slipid.fitting.variances import _cut, whitened
 from slipid.infer.fit_file import load
 from slipid.infer.posterior.coordinates import MOTION, Fitted, around
 from slipid.infer.posterior.density import Density
+from slipid.infer.posterior.variance_draws import conditional, floor_runs, weights_at
+from slipid.infer.posterior.variance_likelihood import linear_parts
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.model import se2
 from slipid.report.html.evidence import read_evidence
@@ -250,6 +252,17 @@ def test_the_sampled_density_has_the_mode_and_the_curvature_of_the_fit(learnt):
     np.testing.assert_allclose(own, std, rtol=0.12)
     correlation = density.covariance / np.outer(std, std)
     np.testing.assert_allclose(found / np.outer(own, own), correlation, atol=0.05)
+    # so has the linear part, from which variances are drawn
+    problem, fitted = around(learnt.problem, whole)
+    part = linear_parts(problem, fitted)[0]
+    weights = weights_at(problem, fitted)
+    linear = conditional(part, floor_runs(part), weights, fitted.log_variance)
+    mine = density.structure
+    own = np.sqrt(np.diag(linear.covariance)[mine])
+    np.testing.assert_allclose(own, std, rtol=0.12)
+    assert np.abs(linear.mean[mine] / std).max() < 0.3
+    several = linear.covariance[np.ix_(mine, mine)] / np.outer(own, own)
+    np.testing.assert_allclose(several, correlation, atol=0.05)
 
 
 @pytest.mark.slow

@@ -110,10 +110,10 @@ class Plan:
     ensembles: int = 4
     walkers: int = 8
     block: int = 20
-    warm_up: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
+    warm_up: tuple[int, ...] = (1, 2, 4, 6)
     most: int = 400
     spread: float = 2.0
-    rows: int = 3000
+    rows: int = 4500
     r_hat: float = 1.01
     steps_per_tau: float = 50.0
     least_draws: float = 1000.0
