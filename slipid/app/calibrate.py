@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.app.bench_priors import COPY_NAME
-from slipid.app.floor_maps import copy_maps
+from slipid.app.floor_maps import copy_maps, map_files
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask
 from slipid.data.runs import Runs
@@ -294,7 +294,7 @@ def write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds:
         write_json(
             out / COPY_NAME, read_json(config.path.parent / bench, "the parameters of a motor")
         )
-    copy_maps(config, out)
+    copy_maps(map_files(config), out)
     logs = {log.name: log.sha256 for log in task.logs}
     inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}
     verdict = {"trust": trust.to_json(), "seed": task.settings.seed}

@@ -81,7 +81,8 @@ class WheeledDrive(Section):
     Attributes:
         wheel_radius_m: rolling radius of the wheels under the robot's weight.
         gear_ratio: motor turns per wheel turn.
-        mass_kg: mass of the robot as it drives; friction scales with it.
+        mass_kg: mass of the robot as it drives; friction scales with it. With several load
+            set-ups it is that of the first one in alphabetical order.
         drives: lists of wheels (counted from 1) that are driven by one motor with one encoder and
             one ammeter, in the order of the columns of the logs. With [[1, 3], [2, 4]], one motor
             drives both left wheels and one both right wheels. By default, each wheel has a motor.

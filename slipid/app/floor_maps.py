@@ -7,17 +7,21 @@ from slipid.data.floor_map import picture_of
 from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
 
+COPIES = "maps"
+"""Name of the folder of the copies, inside a folder of results."""
+
 
 def map_path(config: Config, section: LogsSection) -> Path | None:
     """Return the path of the map of a log section, None for a section without a map.
 
-    The path in a config is relative to the config. The config in a folder of results has copies of
-    its maps beside it.
+    The path in a config is relative to the config. A folder of results, which has a run.json, has
+    copies of the maps, so that later commands use the maps of the fit.
     """
     if section.map is None:
         return None
     named = config.path.parent / section.map
-    return named if named.is_file() else config.path.parent / named.name
+    copied = config.path.parent / COPIES / named.name
+    return copied if copied.is_file() and (config.path.parent / "run.json").is_file() else named
 
 
 def map_files(config: Config) -> dict[str, Path]:
@@ -37,8 +41,10 @@ def map_files(config: Config) -> dict[str, Path]:
     return out
 
 
-def copy_maps(config: Config, out: Path) -> None:
-    """Copy the files of all maps of a config to a folder."""
-    for name, file in map_files(config).items():
-        if file.resolve() != (out / name).resolve():
-            write_bytes(out / name, file.read_bytes())
+def copy_maps(files: dict[str, Path], out: Path) -> None:
+    """Copy files of maps, keyed by file name, to the folder of the copies."""
+    for name, file in files.items():
+        copy = out / COPIES / name
+        if file.resolve() != copy.resolve():
+            copy.parent.mkdir(exist_ok=True)
+            write_bytes(copy, file.read_bytes())

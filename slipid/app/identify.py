@@ -13,6 +13,7 @@ import numpy as np
 from slipid.app.calibrate import calibrated, remarks, write_run
 from slipid.app.check import sanity
 from slipid.app.config import FitSection, read_config
+from slipid.app.floor_maps import map_files
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.data.check.findings import wrong
 from slipid.fitting.multi_floor import multi_floor_runs
@@ -144,7 +145,9 @@ def checked_task(
         DataError: config or logs are wrong.
     """
     setup_jax(quiet=True)
-    task = read_fit_task(read_config(config_path), data, report)
+    config = read_config(config_path)
+    map_files(config)
+    task = read_fit_task(config, data, report)
     report.line(f"{len(task.dataset)} runs on {', '.join(task.robot.surfaces.labels)}")
     _check_sanity(task, report, anyway)
     return task
@@ -339,6 +342,7 @@ def _with_mixed_runs(
     new = summarise(result.problem, result.optimum, task.dataset, task.choices, task.settings.seed)
     floors = floor_errors(fit.contact, new.contact, task.dataset)
     about: dict[str, Any] = {
+        "near": np.asarray(fit.z).tolist(),
         "runs": len(mixed.runs),
         "windows": int(mixed.counts.sum()),
         "before": result.before._asdict(),

@@ -26,7 +26,7 @@ from slipid.app.config import (
     given_settings,
     single_floor_sections,
 )
-from slipid.app.floor_maps import map_files, map_path
+from slipid.app.floor_maps import map_path
 from slipid.app.logs import files_of, read_dataset
 from slipid.data.align.lag import pose_lag
 from slipid.data.check.columns import refuse_misordered
@@ -69,11 +69,39 @@ def weight_priors(
             Choice(f"robot.load_share@{name}", prior_mean=share, prior_std=[std] * len(kg)),
         )
         if name != first and first in known:
-            kg_first, variance_first = known[first]
-            ratio = float(whole / kg_first.sum())
-            std = np.hypot(std, np.sqrt(variance_first) / kg_first.sum()) * np.sqrt(len(kg))
-            mass = Choice(f"robot.mass_ratio@{name}", prior_mean=ratio, prior_std=ratio * std)
+            ratio = float(whole / known[first][0].sum())
+            spread = _ratio_std(weights, known, name, first)
+            mass = Choice(f"robot.mass_ratio@{name}", prior_mean=ratio, prior_std=spread)
             out[name] += (mass,)
+    return out
+
+
+def _ratio_std(
+    weights: Mapping[str, WeightsSection],
+    known: Mapping[str, tuple[Float[np.ndarray, " wheel"], float]],
+    name: str,
+    first: str,
+) -> float:
+    """Return the std of the mass in a load set-up over that in `first`.
+
+    If one of both set-ups is like the other, its weights contain the errors of the other's.
+    """
+    (kg, own), (kg_first, of_first) = known[name], known[first]
+    ratio = kg.sum() / kg_first.sum()
+    if first in _likes(weights, name) or name in _likes(weights, first):
+        shared = min(own, of_first)
+        variance = own + of_first - 2 * shared + (ratio - 1) ** 2 * shared
+    else:
+        variance = own + ratio**2 * of_first
+    return float(np.sqrt(len(kg) * variance) / kg_first.sum())
+
+
+def _likes(weights: Mapping[str, WeightsSection], name: str) -> list[str]:
+    """Return the load set-ups that one refers to, directly or by others."""
+    out = []
+    while (like := weights[name].like) is not None:
+        out.append(like)
+        name = like
     return out
 
 
@@ -273,7 +301,6 @@ def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTa
     `root` is the data folder.
     """
     sections = [section for section in task.config.content.logs if section.map is not None]
-    map_files(task.config)
     found, absent = files_of(task.config, sections, root)
     for section, _ in found:
         floor = _map(task, section)

@@ -59,7 +59,8 @@ def sample(
     report.stage("compiling", usual_s=COMPILING_S)
     problem = task.problem(fit.robot)
     if fit.mixed is not None:
-        problem = problem.with_multi_floor(multi_floor_runs(task.mixed, fit.robot))
+        near = fit.space.tree(np.asarray(fit.mixed["near"]))
+        problem = problem.with_multi_floor(multi_floor_runs(task.mixed, near))
     fit = replace(fit, problem=problem, data=task.dataset)
     # The key has everything that the draws depend on. The largest length of the chain is not part
     # of the key, so that a chain that ended at the limit can be continued with a larger limit.

@@ -116,7 +116,8 @@ class Fit:
             squares; None without currents and voltages.
         mixed: test of the runs over several floors: their prediction errors in a fit to all other
             runs, and in fits that include half of them; and the end-point errors of the runs on one
-            floor, keyed by floor, before and after the runs over several floors were added.
+            floor, keyed by floor, before and after the runs over several floors were added; and
+            the search vector `near`, for whose robot the windows of these runs were cut.
         refused: the content of `mixed`, with a reason, if the runs over several floors contradict
             the runs on one floor and were therefore not fitted.
         data: runs on one floor each; None for a fit that was loaded from its files.

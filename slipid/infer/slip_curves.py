@@ -101,7 +101,8 @@ def torque_of_slip(
 ) -> Float[Array, "surface slip"]:
     """Return the torque [N m] of a wheel that slips by `_SLIP` in its rolling direction.
 
-    The contact law is that of `slipid.model.contact_law` without sideways rolling.
+    The contact law is that of `slipid.model.contact_law` without sideways rolling; the mass is that
+    of the first load set-up.
 
     Args:
         robot: fitted robot.

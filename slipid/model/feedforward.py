@@ -186,9 +186,16 @@ class Known:
     std: float = 0.0
     verdict: str = "fixed"
 
-    def times(self, factor: float) -> "Known":
-        """Return the number multiplied by an exact factor."""
-        return replace(self, value=factor * self.value, std=factor * self.std)
+    def times(self, factor: "float | Known") -> "Known":
+        """Return the number multiplied by an exact factor, or by an independent number.
+
+        The verdict of a product is that of the number with the larger relative std.
+        """
+        if not isinstance(factor, Known):
+            return replace(self, value=factor * self.value, std=factor * self.std)
+        std = float(np.hypot(self.std * factor.value, factor.std * self.value))
+        worse = max((self, factor), key=lambda n: n.std / max(abs(n.value), 1e-300))
+        return Known(self.value * factor.value, std, worse.verdict)
 
 
 def useful(resistance: Known, back_emf: Known) -> bool:

@@ -30,7 +30,7 @@ class Body(eqx.Module):
     """Mass, inertia and load shares.
 
     The leading axis of `load_share` and of `mass_ratio` is the load set-up; `mass` is that of the
-    first one.
+    first one, in alphabetical order.
     """
 
     mass: Array = known("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1)

@@ -40,8 +40,7 @@ class Load:
 
     Attributes:
         path: path of the body's inertia along the axis.
-        factor: inertia at the wheel per inertia of the body, r^2 / (J^T J)_kk [m^2 or 1]; for the
-            mass times its ratio in the load set-up.
+        factor: inertia at the wheel per inertia of the body, r^2 / (J^T J)_kk [m^2 or 1].
     """
 
     path: str
@@ -57,8 +56,10 @@ def robot_feedforwards(robot: DeployedRobot) -> tuple[Feedforward, ...]:
     """
     record = robot.record
     entries = {e.path: e for e in declared_numbers(record)}
-    needed = [*(f"motor.{name}" for name in MOTOR), MASS, YAW_INERTIA]
+    ratio = f"robot.mass_ratio@{robot.load_setup}"
+    needed = [*(f"motor.{name}" for name in MOTOR), MASS, YAW_INERTIA, ratio]
     known = {path: _known(entries[path], record.parameters[path]) for path in needed}
+    known[MASS] = known[MASS].times(known[ratio])
     if record.source == "given" or not useful(known["motor.resistance"], known["motor.back_emf"]):
         return ()
     gear, found = Known(float(record.wheels.gear_ratio)), []
@@ -86,11 +87,8 @@ def _loads(robot: DeployedRobot) -> dict[str, Load | None]:
     coupling = np.abs(unit.T @ unit - np.eye(len(axes))).max()
     if not coupling <= LARGEST_COUPLING:  # NaN if no wheel drives along an axis
         return {"wheel": None}
-    ratio = {MASS: float(robot.mass / np.asarray(robot.record.parameters[MASS].value))}
     return {
-        name: Load(
-            path, ratio.get(path, 1.0) * squared_radius / float(forward[:, k] @ forward[:, k])
-        )
+        name: Load(path, squared_radius / float(forward[:, k] @ forward[:, k]))
         for name, (k, path) in axes.items()
     }
 
@@ -99,13 +97,14 @@ def _known(e: Entry, number: RecordedNumber) -> Known:
     """Return a parameter; one that was neither fitted nor chosen has the std of its prior.
 
     Such a parameter is not identified, except for the mass, which the config states. A parameter
-    at 0, such as a brush drop that is not modelled, counts as exact, and so does the efficiency,
-    at which friction was fitted.
+    at 0, such as a brush drop that is not modelled, counts as exact, and so do the efficiency, at
+    which friction was fitted, and the mass ratio of the first load set-up.
     """
     value = float(np.asarray(number.value))
     if number.verdict != "fixed":
         return Known(value, float(np.asarray(number.std or 0.0)), number.verdict)
-    if number.provenance != "borrowed" or value == 0 or e.path == "motor.efficiency":
+    exact = e.path == "motor.efficiency" or (e.declaration.relative and e.index == 0)
+    if number.provenance != "borrowed" or value == 0 or exact:
         return Known(value)
     std = float(np.asarray(e.declaration.slope(value))) * e.declaration.spread
     return Known(value, std, "fixed" if e.path == MASS else "not_identified")

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.image import imsave
 
 from slipid.app.config import parsed
-from slipid.app.floor_maps import copy_maps, map_path
+from slipid.app.floor_maps import copy_maps, map_files, map_path
 from slipid.data.floor_map import read_map
 from slipid.support.errors import DataError
 from tests.app.test_config import GOOD
@@ -32,13 +32,16 @@ def test_maps_and_their_pictures_are_read_from_the_copies(tmp_path):
     (home / "maps/a.toml").write_text(PLAIN, encoding="utf-8")
     (home / "maps/b.toml").write_text(PICTURED, encoding="utf-8")
     imsave(home / "maps/top/view.png", np.full((3, 4, 3), 0.5))
-    config = config_with(home, "maps/a.toml", "maps/b.toml", "maps/a.toml")
-    copy_maps(config, out)
-    assert sorted(p.name for p in out.iterdir()) == ["a.toml", "b.toml", "view.png"]
-    copied = config_with(out, "maps/a.toml", "maps/b.toml")
-    copy_maps(copied, out)  # onto themselves
+    outside = str(home / "maps/b.toml")
+    config = config_with(home, "maps/a.toml", outside, "maps/a.toml")
+    copy_maps(map_files(config), out)
+    assert sorted(p.name for p in (out / "maps").iterdir()) == ["a.toml", "b.toml", "view.png"]
+    copied = config_with(out, "elsewhere/a.toml", outside)
+    assert map_path(copied, copied.content.logs[-1]) == home / "maps/b.toml"
+    (out / "run.json").touch()  # now it is a folder of results
+    copy_maps(map_files(copied), out)  # onto themselves
     one, other = (map_path(copied, s) for s in copied.content.logs[-2:])
-    assert (one, other) == (out / "a.toml", out / "b.toml")
+    assert (one, other) == (out / "maps/a.toml", out / "maps/b.toml")
     assert read_map(one).surfaces == ("gray",)
     assert read_map(other).cells.shape == (3, 4)
     assert map_path(copied, copied.content.logs[0]) is None
@@ -49,6 +52,5 @@ def test_maps_of_one_name_must_not_differ(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.toml").write_text(text, encoding="utf-8")
     with pytest.raises(DataError, match=r"two/a\.toml and .*one/a\.toml differ; expected"):
-        copy_maps(config_with(tmp_path, "one/a.toml", "two/a.toml"), tmp_path)
-    copy_maps(config_with(tmp_path, "one/a.toml"), tmp_path)
-    assert (tmp_path / "a.toml").read_text(encoding="utf-8") == PLAIN
+        map_files(config_with(tmp_path, "one/a.toml", "two/a.toml"))
+    assert map_files(config_with(tmp_path, "one/a.toml")) == {"a.toml": tmp_path / "one/a.toml"}

@@ -78,8 +78,10 @@ def test_chains_are_of_windows_and_choices_as_the_fit_has_them(monkeypatch, tmp_
         def problem(self, near):
             raise Asked(near, self.choices)
 
-    fit = SimpleNamespace(robot="the robot of the fit", choices="those of its calibration, too")
-    nothing = ("_refuse_mixed", "log_folder", "_refuse_other_logs", "read_config")
+    fit = SimpleNamespace(
+        robot="the robot of the fit", choices="those of its calibration, too", mixed=None
+    )
+    nothing = ("log_folder", "_refuse_other_logs", "read_config")
     for name in nothing:
         monkeypatch.setattr(sample, name, lambda *_: None)
     monkeypatch.setattr(sample, "load", lambda _: fit)

@@ -60,6 +60,11 @@ def test_masses_over_that_of_the_first_load_setup_need_both_weights():
     # of three scales: 0.15 sqrt(3) of 15 kg and 0.06 sqrt(3) of 12 kg
     assert mass.prior_std == pytest.approx(1.25 * np.sqrt(3) * np.hypot(0.01, 0.005))
     assert len(weight_priors({"heavy": heavy}, SHAPE, "light")["heavy"]) == 1
+    added = WeightsSection(like="light", mass_kg=3.0, place_m=(0.0, 0.0), std_kg=0.02)
+    mass = weight_priors({"heavy": added, "light": SCALES}, SHAPE, "light")["heavy"][1]
+    assert mass.prior_mean == pytest.approx(1.25)
+    # the scales' errors are in both weights
+    assert mass.prior_std == pytest.approx(np.sqrt(3) * np.hypot(0.02, 0.25 * 0.06) / 12)
 
 
 WEIGHTS = """

@@ -33,8 +33,8 @@ from slipid.fitting.optimise import optimise
 from slipid.fitting.problem import Problem
 from slipid.fitting.variances import _cut, whitened
 from slipid.infer.fit_file import load
-from slipid.infer.posterior.coordinates import MOTION, Fitted, around
-from slipid.infer.posterior.density import Density
+from slipid.infer.posterior.coordinates import ELECTRIC, MOTION, Fitted, around, on_one_floor
+from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.infer.posterior.variance_draws import conditional, floor_runs, weights_at
 from slipid.infer.posterior.variance_likelihood import linear_parts
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
@@ -56,6 +56,8 @@ CHOICES = [
     *(Choice(f"surface.*.{name}", free=True) for name in NUMBERS),
     Choice("surface.*.friction", prior_mean=0.6, prior_std=0.4),
     Choice("motor.back_emf", prior_mean=0.0514, prior_std=0.0025),
+    Choice("motor.coulomb_friction", free=True),
+    Choice("camera.scale", prior_mean=1.1, prior_std=0.01),
 ]
 PLACE, HEADING, CURRENT, OFFSET = 0.0002, 0.0005, 0.05, 0.1
 PER_RUN = 20
@@ -217,9 +219,10 @@ def test_left_out_halves_are_predicted_down_to_the_noise(learnt):
     noise = np.sqrt(2) * np.array([1.1 * PLACE, HEADING]) / 0.25
     assert learnt.after.yaw_rate < learnt.before.yaw_rate
     assert learnt.after.speed < learnt.before.speed
-    assert learnt.gain == learnt.after.over(learnt.before) < 1
-    assert replace(learnt, settled=False).gain is None
-    assert replace(learnt, after=None).gain is None
+    of_motion = replace(learnt, after=learnt.after._replace(current=None), settled=True)
+    assert of_motion.gain == of_motion.after.over(learnt.before) < 1
+    assert replace(of_motion, settled=False).gain is None
+    assert replace(of_motion, after=None).gain is None
     assert learnt.after.yaw_rate == pytest.approx(noise[1], rel=0.15)
     assert learnt.after.speed == pytest.approx(np.sqrt(2) * noise[0], rel=0.25)
     assert learnt.after.current == pytest.approx(np.hypot(CURRENT, OFFSET), rel=0.25)
@@ -263,6 +266,35 @@ def test_the_sampled_density_has_the_mode_and_the_curvature_of_the_fit(learnt):
     assert np.abs(linear.mean[mine] / std).max() < 0.3
     several = linear.covariance[np.ix_(mine, mine)] / np.outer(own, own)
     np.testing.assert_allclose(several, correlation, atol=0.05)
+
+
+@pytest.mark.slow
+def test_electric_parameters_are_drawn_given_motion_and_friction(learnt):
+    """From the currents of all runs, those over several floors included."""
+    o = learnt.optimum
+    whole = Fitted(o.state.z, o.state.log_variance, o.covariance)
+    problem, fitted = around(learnt.problem, whole)
+    first, second = Density(problem, fitted, MOTION), Density(problem, fitted, ELECTRIC)
+    assert second.names == ("motor.back_emf", "motor.coulomb_friction")
+    x = np.tile(first.centre, (1, 150, 1))
+    found = electric_given_motion(first, second, o.covariance, x, 0)[0][0]
+    precision = np.linalg.inv(o.covariance)[np.ix_(second.structure, second.structure)]
+    given = np.sqrt(np.diag(np.linalg.inv(precision)))
+    np.testing.assert_allclose(found.std(axis=0), given, rtol=0.25)
+    assert np.abs(found.mean(axis=0) - second.centre).max() < 0.4 * given.max()
+
+
+@pytest.mark.slow
+def test_currents_of_runs_over_several_floors_alone_leave_the_motion_to_motion():
+    true = made_robot()
+    w = replace(made(true, runs=24, std=STD, signed=False), has_voltage=False, has_current=False)
+    problem = Problem(w, true, CHOICES).with_multi_floor(crossed(true, 6, 5))
+    log_v = 2 * np.log(problem.noise.typical)
+    size = problem.space.size
+    alone, fitted = on_one_floor(problem, Fitted(problem.space.start, log_v, np.eye(size)))
+    assert not alone.objective.joint
+    assert problem.with_multi_floor(None).objective.joint
+    assert len(fitted.log_variance) == len(alone.noise.names) < len(log_v)
 
 
 @pytest.mark.slow

@@ -69,6 +69,10 @@ def test_a_load_accelerates_with_its_own_mass():
     as_heavy = by_name(fitted_motors("skid", mass={"value": mass}))
     assert heavy["linear"].kA.value == pytest.approx(as_heavy["linear"].kA.value)
     assert heavy["angular"].kA == as_heavy["angular"].kA
+    fitted = {"value": 1.3, "std": 0.3, "verdict": "weak", "provenance": "measured"}
+    unsure = by_name(fitted_motors("skid", **{"mass_ratio@as_built": fitted}))
+    assert heavy["linear"].kA.std < 0.7 * unsure["linear"].kA.std
+    assert (heavy["linear"].kA.verdict, unsure["linear"].kA.verdict) == ("identified", "weak")
 
 
 def test_inertias_that_nobody_knows_are_not_identified():

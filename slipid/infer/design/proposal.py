@@ -151,7 +151,8 @@ def _goals(scope: Scope, planner: Planner) -> dict[Goal, float]:
     weak = [
         parameter_goal(planner, e.path)
         for e in planner.space.free
-        if e.part != "camera" and scope.fit.parameters[e.path].verdict == "weak"
+        if not (e.part == "camera" or e.declaration.relative)
+        and scope.fit.parameters[e.path].verdict == "weak"
     ]
     ends = prediction_goal(planner, "prediction of every floor", scope.all_predicted())
     return {ends: 1.0} | dict.fromkeys(weak, 1.0 / max(len(weak), 1))

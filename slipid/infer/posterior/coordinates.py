@@ -58,10 +58,18 @@ def around(problem: Problem, fitted: Fitted) -> tuple[Problem, Fitted]:
     """
     if problem.multi_floor is None:
         return problem, fitted
-    alone = problem.with_multi_floor(None)
-    kept = [problem.noise.names.index(name) for name in alone.noise.names]
     several = MultiFloorAnchor.at(problem, fitted.z, fitted.log_variance)
-    return alone, replace(fitted, log_variance=fitted.log_variance[kept], multi_floor=several)
+    alone, found = on_one_floor(problem, fitted)
+    return alone, replace(found, multi_floor=several)
+
+
+def on_one_floor(problem: Problem, fitted: Fitted) -> tuple[Problem, Fitted]:
+    """Return the problem without runs over several floors, and the fitted values for it."""
+    alone = problem.with_multi_floor(None)
+    # Currents of the runs left out may be the only ones.
+    alone.objective = replace(alone.objective, joint=problem.objective.joint)
+    kept = [problem.noise.names.index(name) for name in alone.noise.names]
+    return alone, replace(fitted, log_variance=fitted.log_variance[kept])
 
 
 class Coordinates(NamedTuple):

@@ -13,7 +13,8 @@ share some coordinates and have others of their own, so that the log posterior i
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
 
 and moves of the parameters of several floors can be proposed in one evaluation and accepted floor
-by floor.
+by floor. Runs over several floors are one more term, which depends on the parameters of all floors
+and on friction (`multi_floor_anchor.py`); all coordinates are accepted together then.
 
 Electric numbers are drawn for every draw of the motion. Damped Gauss-Newton steps (Levenberg and
 Marquardt) find their most likely values given the motion, and proposals come from a Student t

@@ -14,6 +14,7 @@ exact density.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -105,11 +106,17 @@ class MultiFloorAnchor(eqx.Module):
             change[np.arange(len(friction)), friction] = 1.0
             link = np.linalg.cholesky(precision).T @ change
         off = link @ (z - centre)
+        factor = jnp.asarray(expected(blocks[MULTI_FLOOR_MOTION].count))
+
+        def log_jacobian(x: Array) -> Array:
+            return jnp.sum(factor * runs.log_jacobian(problem.space.tree(x)))
+
+        of_data = np.asarray(jax.grad(log_jacobian)(jnp.asarray(z)))
         twist, slope = twists(problem.space, runs.batch, z)
         return MultiFloorAnchor(
             runs=runs,
             root=root,
-            factor=jnp.asarray(expected(blocks[MULTI_FLOOR_MOTION].count)),
+            factor=factor,
             twist=twist,
             twist_slope=slope,
             friction=friction,
@@ -117,7 +124,7 @@ class MultiFloorAnchor(eqx.Module):
             link=link,
             link_centre=centre,
             information=half.T @ half + link.T @ link,
-            pull=score - link.T @ off,
+            pull=score + of_data - link.T @ off,
         )
 
     def predict(self, robot: Robot, change: Float[Array, " free"]) -> lk.Predicted:

@@ -25,7 +25,14 @@ from slipid.fitting.problem import Problem
 from slipid.fitting.variances import DEGREES
 from slipid.infer.posterior import diagnosis, ensemble
 from slipid.infer.posterior.blocks import Chain, ChainBlock, Plan
-from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, around
+from slipid.infer.posterior.coordinates import (
+    ELECTRIC,
+    EVERYTHING,
+    MOTION,
+    Fitted,
+    around,
+    on_one_floor,
+)
 from slipid.infer.posterior.density import (
     LEAST_ACCEPTED,
     MOST_REFUSED,
@@ -128,13 +135,12 @@ _AXES = ("x", "y", "yaw")
 def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
     """Return the content of posterior.nc; `about` holds further attributes of the file."""
     fit, problem = found.fit, required(found.fit.problem)
-    alone, fitted = around(required(fit.problem), Fitted.of(fit))
+    alone, fitted = on_one_floor(problem, Fitted.of(fit))
     w, robot, runs = problem.windows, problem.robot, [name for name, _ in fit.runs]
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)
     x = found.z
-    fitted = replace(fitted, z=x.mean(axis=(0, 1)), multi_floor=None)
-    density = Density(alone, fitted, EVERYTHING)
+    density = Density(alone, replace(fitted, z=x.mean(axis=(0, 1))), EVERYTHING)
     per_segment = log_likelihoods(density, x, np.asarray(w.run))
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)

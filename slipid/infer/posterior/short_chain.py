@@ -39,11 +39,11 @@ PROPOSALS = 32
 
 
 def short_chain(problem: Problem, fitted: Fitted, seed: int, report: Reporter) -> Draws | None:
-    """Return draws of the posterior of a fit to runs on one floor each, None if they are useless.
+    """Return draws of the posterior of a fit, None if they are useless.
 
     Args:
-        problem: likelihood of the runs.
-        fitted: fitted values around which the chain starts.
+        problem: likelihood of the runs on one floor each.
+        fitted: fitted values around which the chain starts, with any runs over several floors.
         seed: seed of all random numbers.
         report: reporter of the progress.
     """

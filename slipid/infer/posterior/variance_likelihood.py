@@ -135,8 +135,8 @@ def linear_parts(problem: Problem, fitted: Fitted) -> tuple[LinearPart, ...]:
     """Return the part of motion residuals, and that of currents and voltages if they are logged.
 
     As in the fit, currents do not inform about parameters of the motion. In their part, these are
-    drawn from the posterior given the motion. Runs over several floors are a Gaussian of the
-    parameters, with their variances as fitted.
+    drawn from the posterior given the motion. In the part of the motion, runs over several floors
+    are a Gaussian of the parameters, with the variances as fitted; that of currents lacks them.
     """
     objective, z, log_v = problem.objective, fitted.z, fitted.log_variance
     noises, electric = problem.noise.blocks, problem.electric(fitted.z, fitted.log_variance)

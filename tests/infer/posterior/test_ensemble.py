@@ -19,17 +19,20 @@ from tests.helpers.memory import holding
 PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(1, 2, 3, 5), most=120, spread=6.0, rows=300)
 
 
-def known(residuals, group, centre, covariance, prior=None, positive=()):
+def known(residuals, group, centre, covariance, prior=None, positive=(), link=None):
     """Return a target from a function of (vectors, group) that returns residuals and remainder.
 
-    `prior` holds the mean and the std of every coordinate, infinite where there is none.
+    `prior` holds the mean and the std of every coordinate, infinite where there is none; `link`
+    its matrix and its centre.
     """
     size, groups = len(group), int(group.max()) + 1
     mean, std = prior or (np.zeros(size), np.full(size, np.inf))
+    link, middle = link or (np.zeros((0, size)), np.zeros(size))
 
     def terms(x):
         out = np.zeros((len(x), groups + 1))
         np.add.at(out.T, group, -0.5 * (((x - mean) / std) ** 2).T)
+        out[:, -1] -= 0.5 * (((x - middle) @ link.T) ** 2).sum(axis=1)
         for g in range(groups):
             y, c = residuals(x, g)
             out[:, g] += c - 0.5 * (y**2).sum(axis=1)
@@ -38,9 +41,8 @@ def known(residuals, group, centre, covariance, prior=None, positive=()):
     depends = (group == np.arange(groups)[:, None]) | (group < 0)
     of_positive = np.isin(np.arange(size), positive)
     names = tuple(f"x{k}" for k in range(size))
-    return LogDensity(
-        names, terms, residuals, depends, group, of_positive, mean, std, centre, covariance
-    )
+    about = centre, covariance, link, middle
+    return LogDensity(names, terms, residuals, depends, group, of_positive, mean, std, *about)
 
 
 def gaussian():
@@ -64,9 +66,11 @@ def gaussian():
         return y, np.zeros(len(x))
 
     covariance = root @ root.T
-    prior = np.where(shared, mean, 0.0), np.where(shared, spread, np.inf)
+    # the prior of the second shared number is a link
+    prior = np.where(shared, mean, 0.0), np.where(np.arange(8) == 0, spread, np.inf)
+    link = np.where(np.arange(8) == 4, 1 / spread, 0.0)[None], mean
     off = mean + 0.7 * np.sqrt(np.diag(covariance))
-    target = known(residuals, group, off, 0.6 * covariance, prior)
+    target = known(residuals, group, off, 0.6 * covariance, prior, link=link)
     return target, mean, np.sqrt(np.diag(covariance))
 
 

@@ -414,7 +414,8 @@ def _remedies(found: Results) -> list[Block]:
         if paths:
             out.append(f"{where}: for {enumerated(paths)}")
     verdicts = {p: e["verdict"] for p, e in found.parameters.items() if "session_yaw" not in p}
-    weak = [path for path, word in verdicts.items() if word == "weak"]
+    # No runs can distinguish a mass ratio from motors in another state.
+    weak = [p for p, word in verdicts.items() if word == "weak" and "mass_ratio@" not in p]
     if weak and found.design is None:
         command = f"slipid design {found.folder.name}"
         out.append(
