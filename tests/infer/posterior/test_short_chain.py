@@ -45,6 +45,17 @@ def test_the_chain_is_the_same_for_the_same_seed(chained):
     np.testing.assert_array_equal(again.z, chained.chain.z)
 
 
+def test_uncertain_variances_widen_the_draws_of_the_motion(chained, monkeypatch):
+    problem, fitted = required(chained.problem), Fitted.of(chained)
+    sharp = np.flatnonzero((np.sqrt(np.diag(fitted.covariance)) < 0.02) & ~problem.space.electric)
+    added = np.zeros_like(fitted.covariance)
+    added[sharp, sharp] = 8 * np.diag(fitted.covariance)[sharp]
+    monkeypatch.setattr(module, "added_covariance", lambda *_: added)
+    wide = short_chain(problem, fitted, 0, Reporter(quiet=True)).flat.std(axis=0)
+    ratio = wide[sharp] / np.sqrt(np.diag(fitted.covariance)[sharp])
+    np.testing.assert_allclose(ratio, 3.0, rtol=0.15)
+
+
 def test_a_chain_that_refuses_electric_proposals_is_of_no_use(chained, monkeypatch):
     drawn = module.electric_given_motion
 
