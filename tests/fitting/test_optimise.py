@@ -7,6 +7,7 @@ import weakref
 from dataclasses import replace
 from itertools import pairwise
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -101,6 +102,18 @@ def surface_fit(surface_problem):
     told = []
     best = optimise(surface_problem, start=begin(surface_problem), **PRECISE, tell=told.append)
     return best, told
+
+
+def test_a_fit_on_a_gpu_has_the_numbers_of_one_on_a_cpu(truth, surface_problem, surface_fit):
+    try:
+        gpu = jax.devices("gpu")[0]
+    except RuntimeError:
+        pytest.skip("JAX sees no GPU")
+    with jax.default_device(gpu):
+        problem = Problem(surface_problem.windows, truth, SURFACE)
+        again = optimise(problem, start=begin(problem), **PRECISE)
+    std = np.sqrt(np.diag(surface_fit[0].covariance))
+    assert np.abs((again.state.z - surface_fit[0].state.z) / std).max() < 1e-3
 
 
 @pytest.mark.parametrize("path", LEVEL[:3])
