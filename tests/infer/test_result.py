@@ -445,7 +445,7 @@ def test_draws_that_contradict_the_laplace_approximation_replace_it_also_in_file
     assert load(tmp_path).derived == chained.derived
 
 
-def test_a_fit_that_converged_and_knows_one_floor_per_run_has_a_chain_if_it_is_wanted(monkeypatch):
+def test_a_fit_that_converged_has_a_chain_if_it_is_wanted(monkeypatch):
     from slipid.app import identify
     from slipid.app.config import FitSection
 
@@ -459,7 +459,7 @@ def test_a_fit_that_converged_and_knows_one_floor_per_run_has_a_chain_if_it_is_w
     assert chain(fit, "sampled") is found
     assert chain(fit, "laplace") is None
     assert chain(replace(fit, converged=False), "sampled") is None
-    assert chain(replace(fit, mixed={"runs": 3}), "sampled") is None
+    assert chain(replace(fit, mixed={"runs": 3}), "sampled") is found
     assert chain(replace(fit, refused={"reason": "they contradict"}), "sampled") is found
 
 

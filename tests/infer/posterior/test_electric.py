@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -62,9 +63,13 @@ def drawn(first, second, covariance, motion, seed=0):
     return electric_given_motion(first, second, covariance, many, seed)
 
 
+def repeated(held, count):
+    return jax.tree.map(lambda h: np.repeat(h, count, axis=0), held)
+
+
 def log_prob(second, held, x):
     """Return the log density at many vectors, all given one draw of the motion."""
-    many = type(held)(*(np.repeat(h, len(x), axis=0) for h in held))
+    many = repeated(held, len(x))
     return np.asarray(second.mapped(Density.log_prob, x, many))
 
 
@@ -76,7 +81,7 @@ def gaussian(second, held):
 
     mode = minimize(loss, second.centre, jac=True, method="BFGS").x
     h = 1e-3 * np.eye(second.size)
-    many = type(held)(*(np.repeat(k, second.size, axis=0) for k in held))
+    many = repeated(held, second.size)
     bend = -(slope(second, mode + h, many) - slope(second, mode - h, many)) / 2e-3
     return mode, np.linalg.inv(0.5 * (bend + bend.T))
 
