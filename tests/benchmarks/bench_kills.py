@@ -12,7 +12,7 @@ from tests.benchmarks.quick import quick
 from tests.cli import test_cli
 
 KILLS = quick(20, 1)
-JOB = ("--draws", "40", "--most", "160", "--quiet")
+JOB = ("--draws", "40", "--most", "600", "--block", "4", "--quiet")
 
 
 def test_twenty_kills(small, tmp_path):

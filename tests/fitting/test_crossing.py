@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 from typer.testing import CliRunner
 
+from slipid.app import sample as sampling
 from slipid.app.config import read_config
 from slipid.app.logs import packaged_config
 from slipid.app.problem import read_fit_task, with_mixed
@@ -625,7 +626,7 @@ def invoke(*words):
 
 
 @pytest.mark.slow
-def test_identify_learns_from_them_and_later_commands_know(tmp_path):
+def test_identify_learns_from_them_and_later_commands_know(tmp_path, monkeypatch):
     drives = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
     true = true_robot(drives)
     write_logs(
@@ -668,7 +669,13 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path):
     assert judged.exit_code == 0, judged.stderr
     assert len(json.loads((tmp_path / "v.json").read_text())["runs"]) == 12
     (tmp_path / "site.toml").unlink()  # the folder of the results has a copy
-    drawn = invoke("sample", out, "--most", 40, "--draws", 10)
+    whole = sampling.sample
+
+    def of_few_rows(out, data, plan, *more):
+        return whole(out, data, replace(plan, rows=300, warm_up=(1, 2)), *more)
+
+    monkeypatch.setattr(sampling, "sample", of_few_rows)
+    drawn = invoke("sample", out, "--most", 40, "--block", 2, "--draws", 10)
     assert drawn.exit_code == 1, drawn.stderr  # so few steps are not converged
     about = json.loads((out / "sample.json").read_text())
     assert about["worst"]["r_hat"] < 1.5

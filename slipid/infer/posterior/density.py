@@ -61,7 +61,7 @@ class HeldMotion(NamedTuple):
 
     z: Float[Array, "*walker free"]
     motor_force: Float[Array, "*walker segment window wheel 2"]
-    multi_floor: Float[Array, "*walker segment window wheel 2"] | None
+    multi_floor: Float[Array, "*walker run time wheel 2"] | None
 
 
 class WhitenedResiduals(NamedTuple):

@@ -104,7 +104,7 @@ def sampled(
 
 def _of_all(
     fit: Fit, alone: Problem, drawn: Float[np.ndarray, "ensemble draw variance"]
-) -> Float[np.ndarray, "ensemble draw variance"]:
+) -> Float[np.ndarray, "ensemble draw every"]:
     """Return draws of all log variances; those of runs over several floors stay as fitted."""
     names, fitted = required(fit.problem).noise.names, Fitted.of(fit).log_variance
     out = np.broadcast_to(fitted, (*drawn.shape[:2], len(names))).copy()
