@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.app.bench_priors import COPY_NAME
+from slipid.app.bench_priors import COPY_NAME, bench_of
 from slipid.app.floor_maps import copy_maps, map_files
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask
@@ -290,10 +290,8 @@ def read_calibration(out: Path) -> CalibrationFile:
 def write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:
     """Write run.json, and copies of config, maps and bench file, which later commands read."""
     config = task.config
-    if (bench := config.content.wheels.motor) is not None:
-        write_json(
-            out / COPY_NAME, read_json(config.path.parent / bench, "the parameters of a motor")
-        )
+    if (bench := bench_of(config)) is not None:
+        write_json(out / COPY_NAME, read_json(bench[0], "the parameters of a motor"))
     copy_maps(map_files(config), out)
     logs = {log.name: log.sha256 for log in task.logs}
     inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}

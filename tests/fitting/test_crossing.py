@@ -265,6 +265,10 @@ def test_the_sampled_density_has_the_mode_and_the_curvature_of_the_fit(learnt):
     own = np.sqrt(np.diag(linear.covariance)[mine])
     np.testing.assert_allclose(own, std, rtol=0.12)
     assert np.abs(linear.mean[mine] / std).max() < 0.3
+    linked = (density.centre + off - target.link_centre) @ target.link.T
+    values = target.terms(density.centre + off)[:, -2] - 0.5 * (linked**2).sum(axis=1)
+    by_several = (values[:size] - values[size:]) / (2 * step)
+    np.testing.assert_allclose(by_several, fitted.multi_floor.pull[mine] * std, atol=1e-3)
     several = linear.covariance[np.ix_(mine, mine)] / np.outer(own, own)
     np.testing.assert_allclose(several, correlation, atol=0.05)
 
