@@ -83,6 +83,8 @@ def report(rows, folder):
     print(f"all together: coverage {inside.mean():.4f}")
     variances = [k for k, name in enumerate(names) if name.startswith("noise.")]
     report_kinds([names[k].removeprefix("noise.") for k in variances], rank[:, variances])
+    repeated = [k for k, name in enumerate(names) if name.startswith("repeated.")]
+    print_kinds({"repeated runs": repeated}, rank)
     if folder.is_dir():
         draw(names, bins, count, folder / "ranks.png")
     share = inside.mean(axis=0)
@@ -96,7 +98,11 @@ def report_kinds(names, rank):
         kind, *_, what = name.split(".")
         of_axis = kind in ("process", "run", "neighbours", "session")
         kinds.setdefault(kind if of_axis else f"{kind}.{what}", []).append(k)
-    kinds["all"] = list(range(len(names)))
+    print_kinds(kinds | {"all": list(range(len(names)))}, rank)
+
+
+def print_kinds(kinds, rank):
+    """Print the coverage of kinds of coordinates (their places), and their ranks."""
     print(f"\n{len(rank)} experiments, coverage of 90 % intervals with its Monte Carlo error")
     for kind, mine in kinds.items():
         of = rank[:, mine]

@@ -29,6 +29,9 @@ from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 from tests.helpers.made_windows import made, robot
 
+REPEATED = {"firm.straight": 0, "firm.turning": 4, "soft.straight": 1, "soft.turning": 9}
+"""Segments whose motion is predicted, were the experiment done again."""
+PREDICTED = [f"repeated.{name}.{axis}" for name in REPEATED for axis in ("x", "y", "heading")]
 PLAN = Plan(ensembles=2, walkers=16, block=10, warm_up=(1, 2, 4, 6), most=12, rows=600)
 DRAWS = 50
 """Of each of the plan's ensembles."""
@@ -43,6 +46,7 @@ CHOICES = [
     Choice("*", free=False),
     *(Choice(path, prior_mean=x, prior_std=0.4 * x) for path, x in CENTRE.items()),
     Choice("robot.load_share@*", free=True),
+    Choice("robot.mass_ratio@*", free=True),
     Choice("surface.*.load_bias", free=True),
     Choice("camera.scale", prior_mean=1.1, prior_std=0.01),
     Choice("camera.marker_yaw", prior_mean=0.0, prior_std=0.05),
@@ -54,10 +58,10 @@ class Replicate:
     """One made experiment.
 
     Attributes:
-        names: of the numbers, then of the log variances.
+        names: of the numbers, then of the log variances, then of what a repetition shows.
         truth: of them.
         draws: of them (ensemble, draw, number).
-        ratio: std of the draws over that of the prior.
+        ratio: std of the draws over that of the prior; NaN for what a repetition shows.
         r_hat: largest of the first stage.
     """
 
@@ -134,10 +138,15 @@ def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
     space, names = fit.space, problem().noise.names
     found = posterior.sampled(fit, replace(plan, seed=seed), DRAWS, None, Reporter(quiet=True))
     draws = np.concatenate([found.z, found.log_variance], axis=-1)
+    rng = np.random.default_rng([seed, 1])
+    driven = repetition(truth, rng)
+    again = np.apply_along_axis(repetition, -1, draws, rng)
     prior_std = np.concatenate([space.prior_std, np.full(len(names), VARIANCE_SPREAD)])
+    prior_std = np.append(prior_std, np.full(len(driven), np.nan))
+    draws = np.concatenate([draws, again], axis=-1)
     return Replicate(
-        names=(*space.names, *(f"noise.{name}" for name in names)),
-        truth=truth,
+        names=(*space.names, *(f"noise.{name}" for name in names), *PREDICTED),
+        truth=np.append(truth, driven),
         draws=draws,
         ratio=draws.std(axis=(0, 1)) / prior_std,
         r_hat=float(found.diagnosis.r_hat.max()),
@@ -150,6 +159,19 @@ def variance_ranks(seed: int, draws: int = 400) -> np.ndarray:
     fitted = Fitted.of(fit)
     drawn = drawn_variances(fit.problem, fitted, (PLAN.ensembles, draws), seed)
     return (drawn < truth[fit.space.size :]).mean(axis=(0, 1))
+
+
+def repetition(numbers: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Motion over some segments if the experiment is done again, with all its noise (prediction,).
+
+    Args:
+        numbers: search vector, then log variances.
+    """
+    common = problem()
+    z, log_v = np.split(numbers, [common.space.size])
+    increment = np.asarray(_increment(common.space.tree(jnp.asarray(z)), common.batch))
+    off = noise(common, "motion", log_v, rng) + shared(common, log_v, rng)
+    return (increment - off.reshape(increment.shape))[list(REPEATED.values())].sum(axis=1).ravel()
 
 
 def filled(common: Problem, z: np.ndarray, log_v: np.ndarray, rng: np.random.Generator):
@@ -215,6 +237,11 @@ def _predicted(truth, b):
         lk.corrected(truth, b.pose)[:, 0],
         lk.predicted_current(truth, b, p.motor_force),
     )
+
+
+@jax.jit
+def _increment(truth, b):
+    return lk.predict(truth, b).increment
 
 
 @jax.jit
