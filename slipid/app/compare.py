@@ -12,14 +12,17 @@ import numpy as np
 
 from slipid.app.calibrate import calibrated, read_calibration
 from slipid.app.config import Config, read_config, single_floor_sections
+from slipid.app.identify import with_mixed_runs
 from slipid.app.logs import read_dataset
-from slipid.app.problem import ConfigFitTask, read_fit_task, shape_of
+from slipid.app.problem import ConfigFitTask, read_fit_task, shape_of, with_mixed
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.fitting.optimise import optimise
+from slipid.fitting.multi_floor import multi_floor_runs
+from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import load
 from slipid.infer.result import Fit
+from slipid.infer.summary import summarise
 from slipid.model.robot import Robot
 from slipid.predict.folds import Fold, folds_of, judge
 from slipid.predict.kinematics import nominal
@@ -58,7 +61,7 @@ def compare(
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
-    task = read_fit_task(config, data, report)
+    task = with_mixed(read_fit_task(config, data, report), data, report)
     refuse_misordered(task.logs)
     folds_by_question = {name: folds_of(task.dataset, name) for name in dict.fromkeys(questions)}
     for name in [name for name, fold in folds_by_question.items() if (fold < 0).all()]:
@@ -73,13 +76,21 @@ def compare(
     problem = task.problem()
     writable(out)
     key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
-    results, robot = _folds(task, problem, folds_by_question, Checkpoint(out / FOLDS, key), report)
+    kept = Checkpoint(out / FOLDS, key)
+    problem, robot = _of_all_runs(task, problem, kept, report)
+    results = _folds(task, problem, folds_by_question, kept, report)
+    over_floors = problem.multi_floor.runs if problem.multi_floor is not None else ()
     surfaces = transfer(problem.windows, robot) if problem.windows.has_current else {}
     content: Content = {
         "schema": SCHEMA,
         "questions": {name: _answer(folds) for name, folds in results.items()},
         "surfaces": surfaces,
-        "data": {"hash": task.data_hash, "runs": len(task.dataset), "skipped": list(task.skipped)},
+        "data": {
+            "hash": task.data_hash,
+            "runs": len(task.dataset),
+            "runs_over_several_floors": len(over_floors),
+            "skipped": list(task.skipped),
+        },
         "config": {"name": config.path.name, "sha256": config.hash},
         "versions": versions(),
         "runs": {name: _rows(folds) for name, folds in results.items()},
@@ -120,33 +131,63 @@ def _cost(folds: Sequence[Content]) -> Content:
     return out
 
 
+def _of_all_runs(
+    task: ConfigFitTask, problem: Problem, kept: Checkpoint, report: Reporter
+) -> tuple[Problem, Robot]:
+    """Return the likelihood of all runs and the robot fitted to them.
+
+    Runs over several floors are part of the likelihood unless they contradict the other runs.
+
+    Args:
+        task: the fit task.
+        problem: likelihood of the runs on one floor each.
+        kept: checkpoint of finished fits.
+        report: reporter of the progress.
+    """
+
+    def whole() -> Content:
+        optimum, near = _fit(task, report)(problem), None
+        if task.mixed:
+            alone = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
+            fit, _, optimum = with_mixed_runs(alone, task, problem, optimum, report)
+            near = fit.mixed and fit.mixed["near"]
+        return {"z": optimum.state.z, "near": near}
+
+    report.stage("fitting all runs")
+    found = finished(kept, "all", whole)
+    if found["near"] is not None:
+        near = problem.space.tree(np.asarray(found["near"], float))
+        problem = problem.with_multi_floor(multi_floor_runs(task.mixed, near))
+    return problem, problem.space.tree(np.asarray(found["z"], float))
+
+
+def _fit(task: ConfigFitTask, report: Reporter) -> Callable[..., Optimum]:
+    """Return `optimise` with the limits of a task, which reports its progress."""
+
+    def tell(state: FitState) -> None:
+        report.note(f"{state.stage}, round {state.round}")
+
+    limits = task.settings
+    return partial(optimise, most_rounds=limits.rounds, tolerance=limits.tolerance, tell=tell)
+
+
 def _folds(
     task: ConfigFitTask,
     problem: Problem,
     folds_by_question: Mapping[str, Fold],
     kept: Checkpoint,
     report: Reporter,
-) -> tuple[dict[str, list[Content]], Robot]:
-    """Return the results of all folds, keyed by the kind of fold, and the robot fitted to all runs.
+) -> dict[str, list[Content]]:
+    """Return the results of all folds, keyed by the kind of fold.
 
     Args:
         task: the fit task.
         problem: likelihood of all runs.
         folds_by_question: index of each run's fold, keyed by the kind of fold.
-        kept: checkpoint of finished folds.
+        kept: checkpoint of finished fits.
         report: reporter of the progress.
     """
-    settings = task.settings
-
-    def tell(state: FitState) -> None:
-        report.note(f"{state.stage}, round {state.round}")
-
-    fit = partial(optimise, most_rounds=settings.rounds, tolerance=settings.tolerance, tell=tell)
-
-    def whole() -> Content:
-        optimum = fit(problem)
-        z, log_variance = optimum.state.z, optimum.state.log_variance
-        return {"z": z, "log_variance": log_variance, "covariance": optimum.covariance}
+    fit = _fit(task, report)
 
     def one(name: str, held_out: np.ndarray) -> Content:
         return judge(problem, task.choices, task.dataset, name, held_out, fit).to_json()
@@ -161,9 +202,7 @@ def _folds(
     for count, ((name, k), make) in enumerate(work.items(), start=1):
         done[name].append(finished(kept, f"{name}_{k}", make))
         report.advance(count, len(work), f"{count} of {len(work)} folds, {name}")
-    report.stage("fitting all runs")
-    content = finished(kept, "all", whole)
-    return done, problem.space.tree(np.asarray(content["z"], float))
+    return done
 
 
 def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:

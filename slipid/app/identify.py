@@ -294,7 +294,7 @@ def summarised(
     report.stage("intervals and verdicts", usual_s=COMPILING_S)
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
-        fit, problem, optimum = _with_mixed_runs(fit, task, problem, optimum, report)
+        fit, problem, optimum = with_mixed_runs(fit, task, problem, optimum, report)
     fit = with_chain(fit, task.settings, report)
     report.stage("predicting held-out runs")
     contact = contact_errors(task.dataset, problem, optimum, report.steps)
@@ -323,7 +323,7 @@ def with_chain(fit: Fit, settings: FitSection, report: Reporter) -> Fit:
     return replace(fit, chain=chain)
 
 
-def _with_mixed_runs(
+def with_mixed_runs(
     fit: Fit, task: FitTask, problem: Problem, optimum: Optimum, report: Reporter
 ) -> tuple[Fit, Problem, Optimum]:
     """Return the fit to all runs, those over several floors included, its problem and optimum.

@@ -179,7 +179,7 @@ class FoldModels:
     """Every model, fitted to the runs that a fold does not hold out.
 
     Attributes:
-        problem: problem of the fit.
+        problem: problem of the runs on one floor each.
         optimum: result of the fit of the force balance.
         models: the fitted models, the force balance first.
         seconds: time to fit [s], keyed by model.
@@ -201,22 +201,31 @@ def fit_fold(
 ) -> FoldModels:
     """Return every slip model, fitted to all runs except `judged`; arguments as in `judge`.
 
-    No measurement of the held-out runs is used.
+    No measurement of the held-out runs is used. Runs over several floors, if the problem has some,
+    are used by the force balance alone, which is fitted to the other runs first.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
     problem = problem_of_runs(problem, choices, data, fitted)
     keep = np.isin(problem.windows.run, fitted).astype(float)
+    alone, kept = problem, problem.full_weight
+    kept[: len(keep)] = keep
     began = time.perf_counter()
-    optimum = fit(problem, keep=keep)
-    contact = force_balance_of(problem, optimum.state, optimum.covariance, keep)
+    if problem.multi_floor is None:
+        optimum = fit(problem, keep=keep)
+    else:
+        alone = problem.with_multi_floor(None)
+        first = fit(alone, keep=keep)
+        start = replace(problem.carried_over(first.state, alone), round=0)
+        optimum = fit(problem, keep=kept, start=start)
+    contact = force_balance_of(problem, optimum.state, optimum.covariance, kept)
     models: list[PredictiveModel] = [contact]
     seconds = {contact.name: time.perf_counter() - began}
     together, shape = inner_folds(data, question, judged), problem.robot.geometry
     for model in slip_models(shape, problem.windows.has_current, together):
         began = time.perf_counter()
-        models.append(fit_with_noise(model, contact, problem, keep))
+        models.append(fit_with_noise(model, contact, alone, keep))
         seconds[model.name] = time.perf_counter() - began
-    return FoldModels(problem, optimum, tuple(models), seconds)
+    return FoldModels(alone, optimum, tuple(models), seconds)
 
 
 def problem_of_runs(

@@ -106,6 +106,11 @@ def show_comparison(page: Page, found: Content) -> None:
                     f"correct 90 % regions: {counted(missed)}"
                 )
         page.line()
+    if crossed := found["data"]["runs_over_several_floors"]:
+        page.line(
+            f"{crossed} runs over several floors are part of every fit of the force balance, and "
+            "of no other model"
+        )
     if found["surfaces"]:
         one = found["surfaces"]["all"]
         page.line(

@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 from typer.testing import CliRunner
 
+from slipid.app import compare
 from slipid.app import sample as sampling
 from slipid.app.config import read_config
 from slipid.app.logs import packaged_config
@@ -672,6 +673,7 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path, monkeypatch
     judged = invoke("validate", out, "--data", tmp_path / "logs", "--json", tmp_path / "v.json")
     assert judged.exit_code == 0, judged.stderr
     assert len(json.loads((tmp_path / "v.json").read_text())["runs"]) == 12
+    compared(config, tmp_path, monkeypatch)
     (tmp_path / "site.toml").unlink()  # the folder of the results has a copy
     whole = sampling.sample
 
@@ -685,6 +687,30 @@ def test_identify_learns_from_them_and_later_commands_know(tmp_path, monkeypatch
     assert about["worst"]["r_hat"] < 1.5
     assert "surface.soft.friction" not in about["coordinates"]  # nothing moves by its friction
     deployed(out)
+
+
+def compared(config, folder, monkeypatch):
+    """The force balance of a fold uses the runs over several floors, and none that is held out."""
+    fits, fit = [], compare.optimise
+
+    def spied(problem, *, keep=None, **more):
+        fits.append((problem.multi_floor is not None, keep))
+        return fit(problem, keep=keep, **more)
+
+    monkeypatch.setattr(compare, "optimise", spied)
+    wish = ("--data", folder / "logs", "--out", folder / "compared", "--folds", "random")
+    said = invoke("compare", config, *wish)
+    assert said.exit_code == 0, said.stderr
+    assert "4 runs over several floors are part of every fit of the force balance" in said.stdout
+    found = json.loads((folder / "compared/comparison.json").read_text())
+    assert found["data"]["runs_over_several_floors"] == 4
+    folds = found["questions"]["random"]["folds"]
+    assert folds > 1
+    assert [crossing for crossing, _ in fits] == [False, *(False, True) * folds]
+    for (_, alone), (_, whole) in zip(fits[1::2], fits[2::2], strict=True):
+        assert 0 < alone.sum() < len(alone)
+        np.testing.assert_array_equal(whole, [*alone, *np.ones(len(whole) - len(alone))])
+        assert len(whole) >= len(alone) + 4
 
 
 def deployed(out):
