@@ -32,17 +32,18 @@ def test_coverage_and_ranks():
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     rows = [row for row in rows if "seed" in row]
     began, done = time.perf_counter(), {row["seed"] for row in rows}
-    with ProcessPoolExecutor(
-        len(os.sched_getaffinity(0)), get_context("spawn"), max_tasks_per_child=50
-    ) as pool:
-        asked = [pool.submit(replicate, k) for k in range(REPLICATES) if k not in done]
-        for answer in as_completed(asked):
-            rows.append(answer.result())
-            if folder.is_dir():
-                with kept.open("a") as file:
-                    file.write(json.dumps(rows[-1]) + "\n")
-            took = time.perf_counter() - began
-            print(f"{len(rows)}: {took:.0f} s, R-hat {rows[-1]['r_hat']:.3f}", flush=True)
+    missing = [k for k in range(REPLICATES) if k not in done]
+    cores = len(os.sched_getaffinity(0))
+    while missing:  # workers' memory grows, and a pool that replaces its workers may hang
+        some, missing = missing[: 50 * cores], missing[50 * cores :]
+        with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
+            for answer in as_completed([pool.submit(replicate, k) for k in some]):
+                rows.append(answer.result())
+                if folder.is_dir():
+                    with kept.open("a") as file:
+                        file.write(json.dumps(rows[-1]) + "\n")
+                took = time.perf_counter() - began
+                print(f"{len(rows)}: {took:.0f} s, R-hat {rows[-1]['r_hat']:.3f}", flush=True)
     covered, even = report(rows, folder)
     assert QUICK or covered.all()
     assert QUICK or even.all()
