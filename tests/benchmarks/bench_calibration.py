@@ -1,7 +1,8 @@
 """Do intervals hold what they say? 200 made experiments with truths from the fit's own prior.
 
 Ranks and intervals of every replicate are kept in the folder that SLIPID_BENCH names, if any, so
-that an interrupted run goes on; the picture of the ranks goes there, too. A process for every core.
+that an interrupted run goes on; the picture of the ranks goes there, too. A process of one thread
+for every core: with more, they wait for each other and take twice the time.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from scipy.stats import binom, chi2
+from threadpoolctl import threadpool_limits
 
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import calibration
@@ -36,7 +38,7 @@ def test_coverage_and_ranks():
     cores = len(os.sched_getaffinity(0))
     while missing:  # workers' memory grows, and a pool that replaces its workers may hang
         some, missing = missing[: 50 * cores], missing[50 * cores :]
-        with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
+        with ProcessPoolExecutor(cores, get_context("spawn"), threadpool_limits, (1,)) as pool:
             for answer in as_completed([pool.submit(replicate, k) for k in some]):
                 rows.append(answer.result())
                 if folder.is_dir():
