@@ -17,8 +17,8 @@ from pathlib import Path
 import jax
 import numpy as np
 from scipy.stats import binom, chi2
-from threadpoolctl import threadpool_limits
 
+from slipid.support.jax_setup import one_blas_thread
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers import calibration
 
@@ -38,7 +38,7 @@ def test_coverage_and_ranks():
     cores = len(os.sched_getaffinity(0))
     while missing:  # workers' memory grows, and a pool that replaces its workers may hang
         some, missing = missing[: 50 * cores], missing[50 * cores :]
-        with ProcessPoolExecutor(cores, get_context("spawn"), threadpool_limits, (1,)) as pool:
+        with ProcessPoolExecutor(cores, get_context("spawn")) as pool:
             for answer in as_completed([pool.submit(replicate, k) for k in some]):
                 rows.append(answer.result())
                 if folder.is_dir():
@@ -63,6 +63,7 @@ def test_coverage_of_variances():
 def replicate(seed):
     """What is kept of one experiment, of a process of its own."""
     jax.config.update("jax_enable_x64", True)
+    one_blas_thread()
     return calibration.row(calibration.replicate(seed)) | {"seed": seed}
 
 
