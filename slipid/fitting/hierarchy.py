@@ -40,7 +40,11 @@ LEAST_RUNS = 30
 With fewer runs, fewer than three end points are expected outside their 90 % regions."""
 _MOST_GROWTH = 10.0
 """Largest factor by which `extrapolation` multiplies variances."""
-_GRID = np.geomspace(0.1, 4.0, 60)
+POOLED_RANGE = (0.1, 4.0)
+"""Range of the std of the floors' load biases, in units of its typical size.
+
+At its lower end, loads of two floors differ by less than a percent."""
+_GRID = np.geomspace(*POOLED_RANGE, 60)
 """Candidate stds of the load biases, as multiples of the typical std."""
 
 
@@ -316,7 +320,7 @@ class PooledStds(NamedTuple):
 
 
 def pooled_stds(precision: Square, z: Search, objective: Objective, log_v: Variances) -> PooledStds:
-    """Return the posterior of the std of the load biases with a half-normal prior, on a grid.
+    """Return the posterior of the std of the load biases, on a grid; its prior is half-normal.
 
     The posterior of the search vector is taken as a Gaussian with mean z and the given precision,
     so that the evidence for every candidate std has a closed form.
@@ -324,26 +328,36 @@ def pooled_stds(precision: Square, z: Search, objective: Objective, log_v: Varia
     Source: Gelman 2006, Bayesian Analysis 1(3), on half-normal priors of group stds.
     """
     at = np.flatnonzero(objective.space.pooled)
-    now = np.exp(-log_v[objective.pooled])
+    deviation = np.zeros(len(precision))
+    deviation[at] = (z - objective.space.prior_mean)[at]
     of_data = np.asarray(precision).copy()
-    offset = np.zeros(len(of_data))
-    offset[at] = (z - objective.space.prior_mean)[at]
-    shifted = of_data @ offset
-    of_data[at, at] -= now
+    of_data[at, at] -= np.exp(-log_v[objective.pooled])
     typical = np.exp(0.5 * float(objective.typical[objective.pooled]))
-    log = []
-    for part in _GRID:
-        with_prior = of_data.copy()
-        with_prior[at, at] += 1 / (part * typical) ** 2
-        root = np.linalg.cholesky(with_prior)
-        half = np.linalg.solve(root, shifted)
-        log.append(
-            0.5 * half @ half
-            - np.log(np.diag(root)).sum()
-            - len(at) * np.log(part * typical)
-            - 0.5 * part**2
-            # The grid is geometric: the interval around a candidate is proportional to its std.
-            + np.log(part)
-        )
-    weight = np.exp(np.array(log) - max(log))
-    return PooledStds(_GRID * typical, weight / weight.sum())
+    return stds_given(of_data, np.asarray(precision) @ deviation, at, typical)
+
+
+def stds_given(
+    precision: Square, pull: Search, at: Int[np.ndarray, " bias"], typical: float
+) -> PooledStds:
+    """Return the posterior of the common std of some coordinates, all coordinates integrated out.
+
+    The likelihood of the coordinates x is a Gaussian, exp(-x^T precision x / 2 + pull^T x). Those
+    `at` have a normal prior with mean zero and this std, whose own prior is half-normal within
+    `POOLED_RANGE`.
+    """
+    rest = np.setdiff1d(np.arange(len(pull)), at)
+    by_rest = np.linalg.solve(precision[np.ix_(rest, rest)], precision[np.ix_(rest, at)])
+    alone = precision[np.ix_(at, at)] - precision[np.ix_(at, rest)] @ by_rest
+    value, vector = np.linalg.eigh(alone)
+    along = vector.T @ (pull[at] - by_rest.T @ pull[rest])
+    std = _GRID * typical
+    with_prior = value + std[:, None] ** -2
+    log = (
+        0.5 * (along**2 / with_prior - np.log(with_prior)).sum(axis=1)
+        - len(at) * np.log(std)
+        - 0.5 * _GRID**2
+        # The grid is geometric: the interval around a candidate is proportional to its std.
+        + np.log(_GRID)
+    )
+    weight = np.exp(log - log.max())
+    return PooledStds(std, weight / weight.sum())

@@ -24,7 +24,9 @@ from tests.benchmarks.quick import QUICK, quick
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SLIPID_DATA") or ROOT.parent / "shared" / "data") / "robotino2022"
 FLOOR = os.environ.get("SLIPID_BENCH_FLOOR", "brown")
-STRETCH_S, NUTS_WARM_UP, NUTS_DRAWS = quick((240.0, 400, 1500), (5.0, 10, 20))
+LONGER = int(os.environ.get("SLIPID_BENCH_LONGER", "1"))
+"""Factor on the numbers of draws of NUTS."""
+STRETCH_S, NUTS_WARM_UP, NUTS_DRAWS = quick((240.0, 400, 1500 * LONGER), (5.0, 10, 20))
 CHAINS = quick(2, 1)
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no real logs: {DATA} is no folder")
@@ -204,6 +206,12 @@ def test_agreement_and_speed(fitted):
             f"{'':21} means differ from slipid's by at most {mean.max():.3f} std "
             f"({density.names[worst]}), stds by {100 * abs(std[wide] - 1):.1f} % "
             f"({density.names[wide]})"
+        )
+        error = np.hypot(1 / np.sqrt(ess), 1 / np.sqrt(ess_of(ours[0])))
+        off = np.abs(flat.mean(0) - other.mean(0)) / other.std(0) / error
+        print(
+            f"{'':21} in Monte Carlo errors: {np.sqrt((off**2).mean()):.2f} (root mean square), "
+            f"{off.max():.1f} at most"
         )
     draws, took = by_stretch(density, flat)
     speed["stretch"] = draws / took

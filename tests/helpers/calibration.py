@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import binom
+from scipy.stats import binom, norm, truncnorm
 
 from slipid.fitting import likelihood as lk
+from slipid.fitting.hierarchy import POOLED_RANGE
 from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import Problem
 from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD
@@ -97,7 +98,8 @@ def experiment(seed: int) -> tuple[Fit, np.ndarray]:
     normal = rng.standard_normal(len(typical))
     log_v = typical + VARIANCE_SPREAD * normal
     pooled = common.objective.pooled  # the prior of its root is half-normal
-    log_v[pooled] = typical[pooled] + 2 * np.log(np.abs(normal[pooled]))
+    part = truncnorm.ppf(norm.cdf(normal[pooled]), *POOLED_RANGE)
+    log_v[pooled] = typical[pooled] + 2 * np.log(part)
     prior_std = np.asarray(common.objective.prior_std(log_v))
     z = space.prior_mean + prior_std * rng.standard_normal(space.size)
     this = common.of(filled(common, z, log_v, rng))

@@ -68,8 +68,9 @@ def sampled(
     report.stage("drawing the variances of the noise", usual_s=COMPILING_S)
     log_variance = drawn_variances(problem, fitted, shape, plan.seed)
     # The chain has the variances of the fit; their uncertainty adds to that of the parameters.
-    added = added_covariance(problem, fitted, log_variance)[np.ix_(*[first.structure] * 2)]
-    x = widened(x, added, plan.seed)
+    added = added_covariance(problem, fitted, log_variance)
+    rng = np.random.default_rng([plan.seed, 2])
+    x = widened(x, added[np.ix_(*[first.structure] * 2)], rng)
     out = np.broadcast_to(fitted.z, (*shape, len(fitted.z))).copy()
     out[..., first.structure] = x
     accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}
@@ -79,7 +80,8 @@ def sampled(
         if second.size:
             report.stage(f"sampling {ELECTRIC}", usual_s=COMPILING_S)
             drawn, moved = electric_given_motion(first, second, fitted.covariance, x, plan.seed)
-            out[..., second.structure] = drawn
+            of_electric = added[np.ix_(*[second.structure] * 2)]
+            out[..., second.structure] = widened(drawn, of_electric, rng)
             accepted[ELECTRIC] = float(moved.mean())
             few = refused(moved)
     if not np.isfinite(out).all():

@@ -72,7 +72,7 @@ def _drawn(first: Density, fitted: Fitted, seed: int, report: Reporter) -> Draws
     x = x.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, size)
     log_variance = drawn_variances(problem, fitted, (1, CONDITIONED), seed, of_motion=True)
     added = added_covariance(problem, fitted, log_variance)[np.ix_(*[first.structure] * 2)]
-    x = widened(x, added, seed)
+    x = widened(x, added, np.random.default_rng([seed, 2]))
     z = np.broadcast_to(fitted.z, (*x.shape[:2], len(fitted.z))).copy()
     z[..., first.structure] = x
     if problem.objective.joint or not (second := Density(problem, fitted, ELECTRIC)).size:

@@ -10,7 +10,8 @@ unit variance. The restricted likelihood of the variances is the likelihood with
 integrated out (Patterson and Thompson 1971, Biometrika 58(3)). A sweep draws all of them, so that
 draws of the variances have the restricted likelihood times their prior as density:
 
-1. d and u together from their Gaussian;
+1. the variance of the load biases, on a grid with d and u integrated out, then d and u together
+   from their Gaussian;
 2. the variances of shared effects by slice sampling, first given u and the residuals, then given
    the effects S u: the two forms together mix whether a variance is small or large (Yu and Meng
    2011, Journal of Computational and Graphical Statistics 20(3));
@@ -23,7 +24,7 @@ infinity if other variances can explain the residuals.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice, pairwise
 from typing import NamedTuple
@@ -32,7 +33,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_solve, solve_triangular
 
-from slipid.fitting.hierarchy import pooled_stds
+from slipid.fitting.hierarchy import stds_given
 from slipid.fitting.problem import Problem
 from slipid.fitting.variances import (
     VARIANCE_SPREAD,
@@ -45,6 +46,7 @@ from slipid.infer.posterior.coordinates import Anchor, Fitted
 from slipid.infer.posterior.moves import Chains, hamiltonian, sliced
 from slipid.infer.posterior.variance_likelihood import (
     LinearPart,
+    PooledPrior,
     Residuals,
     Rows,
     SegmentNoise,
@@ -80,9 +82,8 @@ def drawn_variances(
     """Return draws of the log variances, from a chain for each ensemble.
 
     Draws are spread evenly over the sweeps of a chain; if there are more draws than sweeps, some
-    sweeps count several times. The variance of the load biases is drawn from its evidence on a
-    grid, at the fitted values of all other variances. With `of_motion`, the variances of currents
-    and voltages stay as fitted.
+    sweeps count several times. With `of_motion`, the variances of currents and voltages stay as
+    fitted.
     """
     rng, log_v = np.random.default_rng([seed, 1]), fitted.log_variance
     out = np.broadcast_to(log_v, (*shape, len(log_v))).copy()
@@ -93,16 +94,13 @@ def drawn_variances(
         found = islice(sweeps(part, log_v, shape[0], first, rng), first, first + number)
         chain = np.stack([at.log_variance for at in found], axis=1)[..., part.numbers]
         out[..., part.numbers] = chain[:, (spread * number).astype(int)]
-    pooled = pooled_stds(np.linalg.inv(fitted.covariance), fitted.z, problem.objective, log_v)
-    out[..., problem.objective.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
     return out
 
 
 def widened(
-    x: Float[np.ndarray, "ensemble draw size"], added: Square, seed: int
+    x: Float[np.ndarray, "ensemble draw size"], added: Square, rng: np.random.Generator
 ) -> Float[np.ndarray, "ensemble draw size"]:
     """Return draws at fitted variances, to which the covariance is added that these add."""
-    rng = np.random.default_rng([seed, 2])
     mean = np.zeros(x.shape[-1])
     return x + rng.multivariate_normal(mean, added, x.shape[:2], method="eigh")
 
@@ -110,47 +108,34 @@ def widened(
 def added_covariance(
     problem: Problem, fitted: Fitted, draws: Float[np.ndarray, "ensemble draw variance"]
 ) -> Square:
-    """Return the covariance that uncertain variances add to that of the parameters of the motion.
+    """Return the covariance that uncertain variances add to that of the parameters.
 
-    With runs over several floors, the friction that moves them is one of these parameters.
+    It is that of the parameters of the motion, and that of electric parameters given the motion.
+    With runs over several floors, the friction that moves them is a parameter of the motion.
     With variances v that are drawn, the covariance is E[cov | v] + Cov(mean | v); the covariance at
     the fitted variances is subtracted. Negative eigenvalues of the difference, relative to that
     covariance, are set to zero.
     Source: Kass and Steffey 1989, Journal of the American Statistical Association 84(407).
     """
-    part = linear_parts(problem, fitted)[0]
     some = draws.reshape(-1, draws.shape[-1])
     some = some[np.linspace(0, len(some) - 1, CONDITIONED).astype(int)]
-    floors, at = floor_runs(part), weights_at(problem, fitted)
-
-    def given(log_v: Variances) -> Conditional:
-        return conditional(_with_pooled(part, problem, fitted, log_v), floors, at, log_v)
-
-    before, found = given(fitted.log_variance).covariance, [given(log_v) for log_v in some]
-    between = np.cov([x.mean for x in found], rowvar=False)
-    excess = np.mean([x.covariance for x in found], axis=0) + between - before
-    out, of_motion = np.zeros_like(before), ~problem.space.electric | problem.objective.joint
+    at, of_motion = weights_at(problem, fitted), ~problem.space.electric | problem.objective.joint
     if fitted.multi_floor is not None:
         of_motion[np.asarray(fitted.multi_floor.friction)] = True
-    mine = np.ix_(*[np.flatnonzero(of_motion)] * 2)
-    root = np.linalg.cholesky(before[mine])
-    value, vector = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, excess[mine]).T))
-    out[mine] = (root @ vector * np.maximum(value, 0.0)) @ (root @ vector).T
+    out = np.zeros_like(fitted.covariance)
+    for part, drawn in zip(linear_parts(problem, fitted), (of_motion, ~of_motion), strict=False):
+        if not np.ptp(some[:, part.numbers], axis=0).any():
+            continue
+        floors = floor_runs(part)
+        before = conditional(part, floors, at, fitted.log_variance).covariance
+        found = [conditional(part, floors, at, log_v) for log_v in some]
+        between = np.cov([x.mean for x in found], rowvar=False)
+        excess = np.mean([x.covariance for x in found], axis=0) + between - before
+        mine = np.ix_(*[np.flatnonzero(drawn)] * 2)
+        root = np.linalg.cholesky(before[mine])
+        value, vector = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, excess[mine]).T))
+        out[mine] = (root @ vector * np.maximum(value, 0.0)) @ (root @ vector).T
     return out
-
-
-def _with_pooled(
-    part: LinearPart, problem: Problem, fitted: Fitted, log_v: Variances
-) -> LinearPart:
-    """Return the part with the prior of the load biases that their drawn variance gives."""
-    number = problem.objective.pooled
-    more = np.exp(-log_v[number]) - np.exp(-fitted.log_variance[number])
-    stiffer = np.where(problem.space.pooled, more, 0.0)
-    return replace(
-        part,
-        precision=part.precision + np.diag(stiffer),
-        pull=part.pull + stiffer * (problem.space.prior_mean - fitted.z),
-    )
 
 
 def weights_at(problem: Problem, fitted: Fitted) -> dict[str, np.ndarray]:
@@ -179,7 +164,7 @@ def conditional(
         weight: weight of every segment, keyed by block.
         log_v: log variances.
     """
-    precision, pull = part.precision.copy(), part.pull.copy()
+    precision, pull = part.prior_at(log_v)
     inverse = {
         k: np.linalg.inv(SegmentNoise.of(noise, part.degrees).covariance(log_v[None]))[:, 0]
         * weight[k][:, None, None]
@@ -392,14 +377,17 @@ def _linear_draw(
     for r in rows.values():
         r[..., -1] += r[..., :-1] @ first
     found = [floor_information(floor, rows, inverse, log_v) for floor in floors]
-    precision, pull = part.precision.copy(), part.pull.copy()
+    precision, pull = part.prior_at(log_v)
     for floor, info in zip(floors, found, strict=True):
         precision[np.ix_(floor.columns, floor.columns)] += info.rows[:-1, :-1]
         pull[floor.columns] -= info.rows[:-1, -1]
+    log_v = log_v.copy()
+    if part.pooled is not None:
+        _draw_pooled(part.pooled, precision, pull, log_v, rng)
     root = np.linalg.cholesky(precision)
     noise = solve_triangular(root, rng.standard_normal(len(pull)), lower=True, trans=1)
     change = np.where(part.given.any(axis=1), 0.0, cho_solve((root, True), pull) + noise)
-    log_v, effects = log_v.copy(), []
+    effects = []
     for floor, info in zip(floors, found, strict=True):
         whole = np.append(change[floor.columns], 1.0)
         mean = info.half @ whole + rng.standard_normal(len(info.half))
@@ -407,6 +395,28 @@ def _linear_draw(
         known = info.of_effects, info.pull @ whole
         effects.append(_effect_draws(part, floor, known, coefs, log_v, rng))
     return LinearDraw(log_v, first + change, effects)
+
+
+def _draw_pooled(
+    of: PooledPrior,
+    precision: Square,
+    pull: Search,
+    log_v: Variances,
+    rng: np.random.Generator,
+) -> None:
+    """Draw the variance of the load biases, with the change of the search vector integrated out.
+
+    The log variances are changed in place, and so are the precision and the pull of the change,
+    which contain the prior of the load biases.
+    """
+    before = np.exp(-log_v[of.number])
+    precision[of.at, of.at] -= before
+    pull[of.at] -= before * of.change
+    found = stds_given(precision, pull - precision[:, of.at] @ of.change, of.at, of.typical)
+    std = rng.choice(found.std, p=found.weight)
+    precision[of.at, of.at] += std**-2
+    pull[of.at] += std**-2 * of.change
+    log_v[of.number] = 2 * np.log(std)
 
 
 def _effect_draws(

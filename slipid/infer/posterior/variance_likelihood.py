@@ -59,6 +59,25 @@ class Voltages(eqx.Module):
 
 
 @dataclass(frozen=True, eq=False)
+class PooledPrior:
+    """Prior of the load biases, whose variance is one of those that are drawn.
+
+    Attributes:
+        number: index of this variance.
+        at: indices of the load biases in the search vector.
+        change: prior mean less fitted value of each load bias.
+        fitted: precision of the prior at the fit.
+        typical: scale of the half-normal prior of the std.
+    """
+
+    number: int
+    at: Int[np.ndarray, " bias"]
+    change: Float[np.ndarray, " bias"]
+    fitted: float
+    typical: float
+
+
+@dataclass(frozen=True, eq=False)
 class LinearPart:
     """Residuals that are linear in the search vector, and the variances that they depend on.
 
@@ -72,6 +91,8 @@ class LinearPart:
             all other coordinates.
         shared: effects that the runs on each floor share.
         typical: centre of the prior of every log variance.
+        pooled: prior of the load biases, which `precision` and `pull` contain; None for residuals
+            that do not inform about them.
         voltages: as in `Voltages`; None without voltages.
         degrees: degrees of freedom of the Student t of a segment's residuals.
     """
@@ -83,6 +104,7 @@ class LinearPart:
     given: Square
     shared: tuple[SharedEffects, ...]
     typical: Variances
+    pooled: PooledPrior | None = None
     voltages: Voltages | None = None
     degrees: float = DEGREES
 
@@ -99,7 +121,9 @@ class LinearPart:
     def numbers(self) -> Int[np.ndarray, " drawn"]:
         """Indices of the variances that are drawn."""
         of_effects = [np.asarray(of.numbers)[1:].ravel() for of in self.shared]
-        found = np.unique(np.concatenate([*of_effects, np.flatnonzero(self.member.any(axis=1))]))
+        pooled = np.array([] if self.pooled is None else [self.pooled.number], int)
+        of_segments = np.flatnonzero(self.member.any(axis=1))
+        found = np.unique(np.concatenate([*of_effects, pooled, of_segments]))
         return found[found >= 0]
 
     @property
@@ -110,6 +134,15 @@ class LinearPart:
     def log_prior(self, log_v: np.ndarray) -> np.ndarray:
         """Return the log prior of each log variance, up to a constant."""
         return np.asarray(-0.5 * ((log_v - self.typical) / VARIANCE_SPREAD) ** 2)
+
+    def prior_at(self, log_v: Variances) -> tuple[Square, Search]:
+        """Return copies of `precision` and `pull`, with the drawn variance of the load biases."""
+        precision, pull, of = self.precision.copy(), self.pull.copy(), self.pooled
+        if of is not None:
+            more = np.exp(-log_v[of.number]) - of.fitted
+            precision[of.at, of.at] += more
+            pull[of.at] += more * of.change
+        return precision, pull
 
     def rows_at(self, log_v: Variances) -> Rows:
         """Return derivatives and residuals as in the likelihood, at given variances."""
@@ -160,6 +193,7 @@ def linear_parts(problem: Problem, fitted: Fitted) -> tuple[LinearPart, ...]:
         np.zeros_like(precision),
         objective.shared,
         np.asarray(objective.typical),
+        _pooled_prior(problem, fitted),
     )
     if "current" not in noises:
         return (motion,)
@@ -173,8 +207,21 @@ def linear_parts(problem: Problem, fitted: Fitted) -> tuple[LinearPart, ...]:
         pull=np.where(e, pull, 0.0),
         given=given,
         shared=(),
+        pooled=None,
     )
     return motion, _with_voltages(currents, problem, z) if "voltage" in rows else currents
+
+
+def _pooled_prior(problem: Problem, fitted: Fitted) -> PooledPrior:
+    objective = problem.objective
+    at = np.flatnonzero(problem.space.pooled)
+    return PooledPrior(
+        number=objective.pooled,
+        at=at,
+        change=(problem.space.prior_mean - fitted.z)[at],
+        fitted=float(np.exp(-fitted.log_variance[objective.pooled])),
+        typical=float(np.exp(0.5 * objective.typical[objective.pooled])),
+    )
 
 
 def _augmented(jacobian: Array, residual: Array) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Thinned draws of chains, draws of variances beside them, and convergence."""
+"""Thinned draws of chains, the std of load biases, and convergence."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from slipid.fitting.hierarchy import POOLED_RANGE, pooled_stds
 from slipid.fitting.problem import Problem
 from slipid.infer.posterior.blocks import ChainBlock
-from slipid.infer.posterior.coordinates import Fitted
 from slipid.infer.posterior.sample import thinned
-from slipid.infer.posterior.variance_draws import drawn_variances
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -23,7 +22,6 @@ FREE = [
     Choice("surface.*.creep", free=True),
     Choice("surface.*.load_bias", free=True),
 ]
-SHAPE = (2, 20_000)
 
 
 @pytest.fixture(scope="module")
@@ -32,36 +30,28 @@ def problem():
     return Problem(replace(made(truth, std=STD), has_voltage=False), truth, FREE)
 
 
-def fitted(problem):
-    z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
-    return Fitted(z, log_v, problem.laplace(z, log_v, np.ones(len(problem.windows))))
-
-
-@pytest.mark.slow
-def test_the_std_of_load_biases_is_drawn_from_its_likelihood(problem, monkeypatch):
+def test_the_std_of_load_biases_has_the_posterior_that_its_likelihood_gives(problem):
     """Load biases with known likelihoods have a half-normal prior of their common std."""
-    monkeypatch.setattr("slipid.infer.posterior.variance_draws._SWEEPS", (10, 10))
-    end, at = fitted(problem), problem.space.pooled
-    now, typical = np.exp(0.5 * end.log_variance[problem.objective.pooled]), 0.05
-    sure = 0.02**-2  # precision of the data alone
+    log_v, at, typical = 2 * np.log(problem.noise.typical), problem.space.pooled, 0.05
+    now, sure = np.exp(0.5 * log_v[problem.objective.pooled]), 0.02**-2
     measured = np.array([0.06, -0.09, 0.12, -0.05])
-    covariance = np.diag(np.where(at, 1 / (sure + now**-2), 0.01))
-    z = end.z.copy()
-    z[at] = measured * sure / (sure + now**-2)
-    draws = drawn_variances(problem, Fitted(z, end.log_variance, covariance), SHAPE, 0)
-    std = np.exp(0.5 * draws[..., problem.objective.pooled]).ravel()
 
-    def density(s, power=0):
-        spread = np.sqrt(s**2 + 1 / sure)
-        return s**power * norm.pdf(s / typical) * np.prod(norm.pdf(measured / spread) / spread)
+    def moments(means):
+        def density(s, power=0):
+            spread = np.sqrt(s**2 + 1 / sure)
+            return s**power * norm.pdf(s / typical) * np.prod(norm.pdf(means / spread) / spread)
 
-    whole, first, second = (quad(density, 0, 1, (k,))[0] for k in range(3))
-    mean, square = first / whole, second / whole
-    # the grid's steps are 6 %
-    assert std.mean() == pytest.approx(mean, rel=0.01)
-    assert std.std() == pytest.approx(np.sqrt(square - mean**2), rel=0.03)
-    others = drawn_variances(problem, end, (1, 2000), 0)[..., problem.objective.pooled]
-    assert np.exp(0.5 * others).mean() < 0.6 * mean  # biases of zero mean that floors are similar
+        return np.array([quad(density, low, high, (k,))[0] for k in range(3)])
+
+    low, high = np.array(POOLED_RANGE) * typical
+    for means, near in ((measured, 2e-3), (np.zeros(4), 0.03)):  # the grid has steps of 6 %
+        z = problem.space.start.copy()
+        z[at] = means * sure / (sure + now**-2)
+        precision = np.diag(np.where(at, sure + now**-2, 100.0))
+        found = pooled_stds(precision, z, problem.objective, log_v)
+        whole, first, second = moments(means)
+        assert found.weight @ found.std == pytest.approx(first / whole, rel=near)
+        assert found.weight @ found.std**2 == pytest.approx(second / whole, rel=near)
 
 
 def test_thinned_draws_are_spread_over_steps_and_walkers_and_keep_their_log_density():

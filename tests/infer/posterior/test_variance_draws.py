@@ -6,8 +6,9 @@ from itertools import islice
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_t
+from scipy.stats import multivariate_t, norm
 
+from slipid.fitting.hierarchy import POOLED_RANGE
 from slipid.fitting.noise import Components
 from slipid.fitting.problem import Problem, log_jacobian
 from slipid.fitting.shared_effects import SharedEffects
@@ -19,9 +20,11 @@ from slipid.infer.posterior.variance_draws import (
     floor_information,
     floor_runs,
     sweeps,
+    weights_at,
 )
 from slipid.infer.posterior.variance_likelihood import (
     LinearPart,
+    PooledPrior,
     Residuals,
     SegmentNoise,
     linear_parts,
@@ -186,6 +189,26 @@ def test_the_restricted_likelihood_is_that_of_the_covariance_of_all_residuals(pr
         assert log_det == pytest.approx(np.linalg.slogdet(whole)[1], rel=1e-6)
 
 
+@pytest.mark.slow
+def test_the_std_of_load_biases_is_drawn_from_its_likelihood():
+    """Load biases that are measured directly, with a half-normal prior of their common std."""
+    measured, fitted = np.array([0.06, -0.09, 0.12, -0.05]), np.array([0.03, -0.1, 0.2, 0.0])
+    known, now, typical = 0.02, 0.07, 0.05
+    rows = np.concatenate([np.eye(4)[:, None], (fitted - measured)[:, None, None]], axis=-1)
+    part = replace(
+        part_of(rows, np.ones((1, 1, 1)), known**2, degrees=1e7, typical=np.array([-60.0, 0.0])),
+        precision=np.eye(4) / now**2,
+        pull=-fitted / now**2,
+        pooled=PooledPrior(1, np.arange(4), -fitted, now**-2, typical),
+    )
+    assert part.numbers.tolist() == [0, 1]
+    found = drawn(part, np.array([-60.0, 2 * np.log(now)]), 500)[..., 1]
+    grid = np.linspace(*np.array(POOLED_RANGE) * typical, 4000)
+    spread = np.sqrt(grid[:, None] ** 2 + known**2)
+    log = norm.logpdf(grid / typical) + norm.logpdf(measured, 0.0, spread).sum(axis=1)
+    assert_quantiles(np.exp(0.5 * found), grid, log, effective=1500)
+
+
 def dense_estimate(problem, part, weight, log_v):
     """Estimate of the change of the search vector and its covariance, from dense matrices."""
     rows = part.rows["motion"]
@@ -227,9 +250,35 @@ def test_uncertain_variances_add_to_the_covariance_of_the_motion(problem, fitted
     np.testing.assert_allclose(
         found[np.ix_(motion, motion)], expected, rtol=1e-5, atol=1e-8 * expected.max()
     )
-    assert not found[~motion].any()  # electric parameters are drawn given the motion
+    np.testing.assert_allclose(
+        found[np.ix_(~motion, ~motion)],
+        electric_excess(problem, fitted, larger),
+        rtol=1e-5,
+        atol=1e-12,
+    )
+    # electric parameters are drawn given the motion
+    assert not found[np.ix_(motion, ~motion)].any()
     none = added_covariance(problem, fitted, draws[:1])
     assert np.abs(none).max() < 1e-9 * before.max()
+
+
+def electric_excess(problem, fitted, larger):
+    """What the two sizes of the noise add to the covariance of electric parameters, in full."""
+    part, e = linear_parts(problem, fitted)[1], problem.space.electric
+    weight = weights_at(problem, fitted)
+    found = []
+    for log_v in (fitted.log_variance, larger):
+        information, pull = part.precision.copy(), part.pull.copy()
+        for k, rows in part.rows_at(log_v).items():
+            wide = np.asarray(problem.covariance(k, log_v)) / weight[k][:, None, None]
+            white = np.linalg.solve(wide, rows)
+            product = np.einsum("nmc,nmd->cd", rows, white)
+            information += product[:-1, :-1]
+            pull -= product[:-1, -1]
+        covariance = np.linalg.inv(information[np.ix_(e, e)])
+        found.append((covariance @ pull[e], covariance))
+    (first, before), (second, wide) = found
+    return 0.5 * (wide - before) + np.outer(second - first, second - first) / 4 * 120 / 119
 
 
 def test_the_likelihood_of_a_segment_is_a_student_density_and_has_its_slope(problem, fitted):
