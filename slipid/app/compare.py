@@ -154,7 +154,7 @@ def _of_all_runs(
         return {"z": optimum.state.z, "near": near}
 
     report.stage("fitting all runs")
-    found = finished(kept, "all", whole)
+    found = finished(kept, "all_runs", whole)
     if found["near"] is not None:
         near = problem.space.tree(np.asarray(found["near"], float))
         problem = problem.with_multi_floor(multi_floor_runs(task.mixed, near))
