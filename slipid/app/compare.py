@@ -12,6 +12,7 @@ import numpy as np
 
 from slipid.app.calibrate import calibrated, read_calibration
 from slipid.app.config import Config, read_config, single_floor_sections
+from slipid.app.floor_maps import map_files
 from slipid.app.identify import with_mixed_runs
 from slipid.app.logs import read_dataset
 from slipid.app.problem import ConfigFitTask, read_fit_task, shape_of, with_mixed
@@ -23,8 +24,7 @@ from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import load
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
-from slipid.model.robot import Robot
-from slipid.predict.folds import Fold, folds_of, judge
+from slipid.predict.folds import Fold, folds_of, judge, like_held_out
 from slipid.predict.kinematics import nominal
 from slipid.predict.ranking import ranking, transfer
 from slipid.predict.selection import calibrated_model
@@ -75,11 +75,12 @@ def compare(
     report.stage("cutting windows")
     problem = task.problem()
     writable(out)
-    key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
-    kept = Checkpoint(out / FOLDS, key)
-    problem, robot = _of_all_runs(task, problem, kept, report)
+    maps = sorted((name, file.read_bytes()) for name, file in map_files(config).items())
+    names = problem.space.names, problem.noise.names
+    kept = Checkpoint(out / FOLDS, key_of(config.hash, task.data_hash, *names, maps))
+    problem, whole = _of_all_runs(task, problem, kept, report)
+    robot = problem.space.tree(np.asarray(whole["z"], float))
     results = _folds(task, problem, folds_by_question, kept, report)
-    over_floors = problem.multi_floor.runs if problem.multi_floor is not None else ()
     surfaces = transfer(problem.windows, robot) if problem.windows.has_current else {}
     content: Content = {
         "schema": SCHEMA,
@@ -88,7 +89,10 @@ def compare(
         "data": {
             "hash": task.data_hash,
             "runs": len(task.dataset),
-            "runs_over_several_floors": len(over_floors),
+            "over_several_floors": {
+                "runs": sum(len(of) for of, _ in task.mixed),
+                "refused": whole["refused"],
+            },
             "skipped": list(task.skipped),
         },
         "config": {"name": config.path.name, "sha256": config.hash},
@@ -133,10 +137,12 @@ def _cost(folds: Sequence[Content]) -> Content:
 
 def _of_all_runs(
     task: ConfigFitTask, problem: Problem, kept: Checkpoint, report: Reporter
-) -> tuple[Problem, Robot]:
-    """Return the likelihood of all runs and the robot fitted to them.
+) -> tuple[Problem, Content]:
+    """Return the likelihood of all runs, and the content of the checkpoint of the fit to them.
 
-    Runs over several floors are part of the likelihood unless they contradict the other runs.
+    Runs over several floors are part of the likelihood unless they contradict the other runs. The
+    content has the search vector `z` of the fit, that of the robot `near` which their windows were
+    cut, and the reason why they were `refused`; None if this does not apply.
 
     Args:
         task: the fit task.
@@ -146,19 +152,23 @@ def _of_all_runs(
     """
 
     def whole() -> Content:
-        optimum, near = _fit(task, report)(problem), None
-        if task.mixed:
-            alone = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
-            fit, _, optimum = with_mixed_runs(alone, task, problem, optimum, report)
-            near = fit.mixed and fit.mixed["near"]
-        return {"z": optimum.state.z, "near": near}
+        optimum = _fit(task, report)(problem)
+        if not task.mixed:
+            return {"z": optimum.state.z, "near": None, "refused": None}
+        alone = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
+        fit, _, optimum = with_mixed_runs(alone, task, problem, optimum, report)
+        return {
+            "z": optimum.state.z,
+            "near": fit.mixed and fit.mixed["near"],
+            "refused": fit.refused and fit.refused["reason"],
+        }
 
     report.stage("fitting all runs")
     found = finished(kept, "all_runs", whole)
     if found["near"] is not None:
         near = problem.space.tree(np.asarray(found["near"], float))
         problem = problem.with_multi_floor(multi_floor_runs(task.mixed, near))
-    return problem, problem.space.tree(np.asarray(found["z"], float))
+    return problem, found
 
 
 def _fit(task: ConfigFitTask, report: Reporter) -> Callable[..., Optimum]:
@@ -189,8 +199,15 @@ def _folds(
     """
     fit = _fit(task, report)
 
+    others = [data for data, _ in task.mixed]
+
     def one(name: str, held_out: np.ndarray) -> Content:
-        return judge(problem, task.choices, task.dataset, name, held_out, fit).to_json()
+        beside = None
+        if problem.multi_floor is not None:
+            runs = like_held_out(task.dataset, held_out, others, name)
+            beside = runs[problem.multi_floor.windows.run]
+        found = judge(problem, task.choices, task.dataset, name, held_out, fit, beside)
+        return found.to_json()
 
     work: dict[tuple[str, int], Callable[[], Content]] = {
         (name, k): partial(one, name, np.flatnonzero(fold == k))

@@ -1,7 +1,8 @@
 """Cross-validation of every slip model: the folds of runs, and the scores of each fold.
 
 If headings are held out, all runs of a heading are in the same fold, at every speed and on every
-floor, so that a held-out heading is not fitted on any floor.
+floor, so that a held-out heading is not fitted on any floor. Neither are runs over several floors
+with this commanded heading.
 """
 
 import time
@@ -9,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.fitting.optimise import Optimum, optimise
@@ -152,6 +153,28 @@ def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
     return fold
 
 
+def like_held_out(
+    data: Runs, judged: np.ndarray, others: Sequence[Runs], question: str
+) -> Bool[np.ndarray, " other"]:
+    """Return True for the runs of other sets whose heading or speed a fold of `data` holds out.
+
+    Runs without a commanded heading or speed are not among them.
+
+    Args:
+        data: runs of the fold.
+        judged: indices of the held-out runs.
+        others: other sets of runs, in the order of the result.
+        question: key of `QUESTIONS` by which runs are held out.
+    """
+    heading = np.degrees(np.concatenate([runs.heading for runs in others]))
+    speed = np.concatenate([runs.speed for runs in others])
+    if question == "speeds":
+        return np.isin(np.round(speed, 3), np.round(data.speed[judged], 3))
+    keys = [FoldKey("", *both) for both in zip(heading.tolist(), speed.tolist(), strict=True)]
+    held_out = QUESTIONS[question](fold_keys(data))[judged]
+    return np.isin(QUESTIONS[question](keys), held_out[held_out >= 0])
+
+
 @dataclass(frozen=True)
 class FoldResult:
     """Scores of all models on the runs of a fold, and how the fit of the force balance ended.
@@ -198,17 +221,21 @@ def fit_fold(
     question: str,
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
+    beside: Bool[np.ndarray, " segment"] | None = None,
 ) -> FoldModels:
     """Return every slip model, fitted to all runs except `judged`; arguments as in `judge`.
 
-    No measurement of the held-out runs is used. Runs over several floors, if the problem has some,
-    are used by the force balance alone, which is fitted to the other runs first.
+    No measurement of the held-out runs is used. If the problem has runs over several floors, the
+    force balance is fitted to the other runs first and then to all; the other slip models only
+    take its camera.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
     problem = problem_of_runs(problem, choices, data, fitted)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     alone, kept = problem, problem.full_weight
     kept[: len(keep)] = keep
+    if beside is not None:
+        kept[len(keep) :] = ~beside
     began = time.perf_counter()
     if problem.multi_floor is None:
         optimum = fit(problem, keep=keep)
@@ -246,6 +273,7 @@ def judge(
     question: str,
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
+    beside: Bool[np.ndarray, " segment"] | None = None,
 ) -> FoldResult:
     """Fit every slip model to the runs outside one fold, and return its scores on the fold's runs.
 
@@ -257,8 +285,9 @@ def judge(
             settings on the other runs.
         judged: indices of the held-out runs.
         fit: function that fits the problem.
+        beside: True for segments of runs over several floors that are held out, too.
     """
-    fold = fit_fold(problem, choices, data, question, judged, fit)
+    fold = fit_fold(problem, choices, data, question, judged, fit, beside)
     problem, optimum = fold.problem, fold.optimum
     seconds = {name: {"fit": spent} for name, spent in fold.seconds.items()}
     part = data.subset(judged)

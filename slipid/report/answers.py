@@ -106,10 +106,14 @@ def show_comparison(page: Page, found: Content) -> None:
                     f"correct 90 % regions: {counted(missed)}"
                 )
         page.line()
-    if crossed := found["data"]["runs_over_several_floors"]:
+    over = found["data"]["over_several_floors"]
+    if over["refused"]:
+        page.line(over["refused"])
+    elif over["runs"]:
         page.line(
-            f"{crossed} runs over several floors are part of every fit of the force balance, and "
-            "of no other model"
+            f"the force balance is also fitted to runs over several floors ({over['runs']}), "
+            "without those with a held-out heading or speed; other models take only the camera "
+            "from this fit"
         )
     if found["surfaces"]:
         one = found["surfaces"]["all"]

@@ -32,7 +32,8 @@ def test_coverage_and_ranks():
     folder = Path(os.environ.get("SLIPID_BENCH") or "/nonexistent")
     kept = folder / "calibration.jsonl"
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
-    rows = [row for row in rows if "seed" in row]
+    names = list(calibration.names())
+    rows = [row for row in rows if row.get("names") == names]
     began, done = time.perf_counter(), {row["seed"] for row in rows}
     missing = [k for k in range(REPLICATES) if k not in done]
     cores = len(os.sched_getaffinity(0))

@@ -80,8 +80,9 @@ def test_variance_draws(fit_folder):
 
 def wider(part, weight, fitted, draws):
     """Return the ratio of the parameters' stds over draws of variances to those at the fit."""
-    floors = floor_runs(part)
-    found = [conditional(part, floors, weight, v) for v in draws]
+    floors, every = floor_runs(part), np.arange(len(part.pull))
+    found = [conditional(part, floors, weight, v, every) for v in draws]
     mean = np.array([x.mean for x in found])
     variance = np.mean([np.diag(x.covariance) for x in found], axis=0) + mean.var(axis=0)
-    return np.sqrt(variance / np.diag(conditional(part, floors, weight, fitted).covariance))
+    before = np.diag(conditional(part, floors, weight, fitted, every).covariance)
+    return np.sqrt(variance / before)

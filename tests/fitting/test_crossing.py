@@ -261,7 +261,8 @@ def test_the_sampled_density_has_the_mode_and_the_curvature_of_the_fit(learnt):
     problem, fitted = around(learnt.problem, whole)
     part = linear_parts(problem, fitted)[0]
     weights = weights_at(problem, fitted)
-    linear = conditional(part, floor_runs(part), weights, fitted.log_variance)
+    every = np.arange(problem.space.size)
+    linear = conditional(part, floor_runs(part), weights, fitted.log_variance, every)
     mine = density.structure
     own = np.sqrt(np.diag(linear.covariance)[mine])
     np.testing.assert_allclose(own, std, rtol=0.12)
@@ -701,16 +702,27 @@ def compared(config, folder, monkeypatch):
     wish = ("--data", folder / "logs", "--out", folder / "compared", "--folds", "random")
     said = invoke("compare", config, *wish)
     assert said.exit_code == 0, said.stderr
-    assert "4 runs over several floors are part of every fit of the force balance" in said.stdout
+    assert "is also fitted to runs over several floors (4)" in " ".join(said.stdout.split())
     found = json.loads((folder / "compared/comparison.json").read_text())
-    assert found["data"]["runs_over_several_floors"] == 4
+    assert found["data"]["over_several_floors"] == {"runs": 4, "refused": None}
     folds = found["questions"]["random"]["folds"]
     assert folds > 1
     assert [crossing for crossing, _ in fits] == [False, *(False, True) * folds]
+    beside = []
     for (_, alone), (_, whole) in zip(fits[1::2], fits[2::2], strict=True):
         assert 0 < alone.sum() < len(alone)
-        np.testing.assert_array_equal(whole, [*alone, *np.ones(len(whole) - len(alone))])
+        np.testing.assert_array_equal(whole[: len(alone)], alone)
         assert len(whole) >= len(alone) + 4
+        beside.append(whole[len(alone) :])
+    # a run over several floors is left out with the runs on one floor in its direction
+    assert (np.sum(beside, axis=0) == folds - 1).all()
+    (folder / "site.toml").write_text(MAP.replace("gray", "soft") + "\n", encoding="utf-8")
+
+    def refusing(*_, **__):
+        raise DataError("fitted again")
+
+    monkeypatch.setattr(compare, "optimise", refusing)
+    assert "fitted again" in invoke("compare", config, *wish).stderr  # for another map
 
 
 def deployed(out):

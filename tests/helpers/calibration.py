@@ -134,20 +134,26 @@ def bare_fit(this: Problem, optimum: Optimum) -> Fit:
     )
 
 
+def names() -> tuple[str, ...]:
+    """Names of the coordinates of a replicate."""
+    common = problem()
+    noise = (f"noise.{name}" for name in common.noise.names)
+    return (*common.space.names, *noise, *PREDICTED)
+
+
 def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
     """An experiment and draws of its posterior."""
     fit, truth = experiment(seed)
-    space, names = fit.space, problem().noise.names
     found = posterior.sampled(fit, replace(plan, seed=seed), DRAWS, None, Reporter(quiet=True))
     draws = np.concatenate([found.z, found.log_variance], axis=-1)
-    rng = np.random.default_rng([seed, 1])
+    rng = np.random.default_rng([seed, 3])
     driven = repetition(truth, rng)
     again = np.apply_along_axis(repetition, -1, draws, rng)
-    prior_std = np.concatenate([space.prior_std, np.full(len(names), VARIANCE_SPREAD)])
-    prior_std = np.append(prior_std, np.full(len(driven), np.nan))
+    spread = np.full(found.log_variance.shape[-1], VARIANCE_SPREAD)
+    prior_std = np.concatenate([fit.space.prior_std, spread, np.full(len(driven), np.nan)])
     draws = np.concatenate([draws, again], axis=-1)
     return Replicate(
-        names=(*space.names, *(f"noise.{name}" for name in names), *PREDICTED),
+        names=names(),
         truth=np.append(truth, driven),
         draws=draws,
         ratio=draws.std(axis=(0, 1)) / prior_std,

@@ -156,7 +156,7 @@ def show_validation(page):
     answers.show_validation(page, {"summary": {f: dict.fromkeys(MODELS, one) for f in FLOORS}})
 
 
-def show_comparison(page):
+def show_comparison(page, refused=None):
     models = {f"{m}_{k}": (k, m) for m in MODELS for k in range(6)}
     ranked = {
         name: {"difference": -float(k), "se_clustered": 0.5, "endpoint_error": 1.0312}
@@ -167,7 +167,9 @@ def show_comparison(page):
     cost = {name: {"numbers": {"a": 2, "b": 11, "shared": 5}, "fit_s": 1234.5} for name in models}
     floors = dict.fromkeys(("brown", "gray", "green", "table"), floor)
     question = {"floors": floors, "cost": cost}
-    answers.show_comparison(page, {"questions": {"sectors": question}, "surfaces": None})
+    content = {"questions": {"sectors": question}, "surfaces": None}
+    over = {"runs": 3, "refused": refused}
+    answers.show_comparison(page, content | {"data": {"over_several_floors": over}})
 
 
 def show_design(page):
@@ -248,6 +250,15 @@ def test_the_summary_counts_verdicts_and_names_what_is_not_identified():
     show_parameters(page)
     assert "of 7 free parameters: 2 identified, 4 at a bound, 1 not identified; *: " in page.text
     assert "values of their priors: motor.viscous_friction" in page.text
+
+
+def test_a_comparison_says_whether_runs_over_several_floors_were_used():
+    used, refused = Page(kept=True), Page(kept=True)
+    show_comparison(used)
+    show_comparison(refused, "3 runs contradict the others")
+    assert "also fitted to runs over several floors (3)" in " ".join(used.text.split())
+    assert "3 runs contradict the others" in refused.text
+    assert "also fitted" not in refused.text
 
 
 def test_a_comparison_shows_five_models_and_names_the_files_with_all():

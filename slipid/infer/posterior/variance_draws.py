@@ -124,17 +124,16 @@ def added_covariance(
         of_motion[np.asarray(fitted.multi_floor.friction)] = True
     out = np.zeros_like(fitted.covariance)
     for part, drawn in zip(linear_parts(problem, fitted), (of_motion, ~of_motion), strict=False):
-        if not np.ptp(some[:, part.numbers], axis=0).any():
-            continue
-        floors = floor_runs(part)
-        before = conditional(part, floors, at, fitted.log_variance).covariance
-        found = [conditional(part, floors, at, log_v) for log_v in some]
+        if (some == fitted.log_variance)[:, part.numbers].all():
+            continue  # these variances are not drawn
+        floors, mine = floor_runs(part), np.flatnonzero(drawn)
+        before = conditional(part, floors, at, fitted.log_variance, mine).covariance
+        found = [conditional(part, floors, at, log_v, mine) for log_v in some]
         between = np.cov([x.mean for x in found], rowvar=False)
         excess = np.mean([x.covariance for x in found], axis=0) + between - before
-        mine = np.ix_(*[np.flatnonzero(drawn)] * 2)
-        root = np.linalg.cholesky(before[mine])
-        value, vector = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, excess[mine]).T))
-        out[mine] = (root @ vector * np.maximum(value, 0.0)) @ (root @ vector).T
+        root = np.linalg.cholesky(before)
+        value, vector = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, excess).T))
+        out[np.ix_(mine, mine)] = (root @ vector * np.maximum(value, 0.0)) @ (root @ vector).T
     return out
 
 
@@ -144,10 +143,10 @@ def weights_at(problem: Problem, fitted: Fitted) -> dict[str, np.ndarray]:
 
 
 class Conditional(NamedTuple):
-    """Distribution of the change of the search vector, given variances and weights of segments."""
+    """Distribution of changes of coordinates, given variances and weights of segments."""
 
-    mean: Search
-    covariance: Square
+    mean: Float[np.ndarray, " some"]
+    covariance: Float[np.ndarray, "some some"]
 
 
 def conditional(
@@ -155,14 +154,18 @@ def conditional(
     floors: Sequence["FloorRuns"],
     weight: dict[str, np.ndarray],
     log_v: Variances,
+    some: Int[np.ndarray, " some"],
 ) -> Conditional:
-    """Return the distribution of the change of the search vector, shared effects integrated out.
+    """Return the distribution of some coordinates' changes, shared effects integrated out.
+
+    All other coordinates stay at the fit.
 
     Args:
         part: residuals that are linear in the search vector.
         floors: runs of each floor, from `floor_runs`.
         weight: weight of every segment, keyed by block.
         log_v: log variances.
+        some: indices of the coordinates in the search vector.
     """
     precision, pull = part.prior_at(log_v)
     inverse = {
@@ -175,8 +178,8 @@ def conditional(
         rows = floor_information(floor, whole, inverse, log_v).rows
         precision[np.ix_(floor.columns, floor.columns)] += rows[:-1, :-1]
         pull[floor.columns] -= rows[:-1, -1]
-    covariance = np.linalg.inv(precision)
-    return Conditional(covariance @ pull, covariance)
+    covariance = np.linalg.inv(precision[np.ix_(some, some)])
+    return Conditional(covariance @ pull[some], covariance)
 
 
 class Sweep(NamedTuple):
@@ -292,7 +295,7 @@ class LinearDraw(NamedTuple):
     """A draw of what residuals are linear in, given weights, with the variances of its effects.
 
     Attributes:
-        log_variance: all log variances, those of shared effects drawn anew.
+        log_variance: all log variances, those of shared effects and of load biases drawn anew.
         change: change of the search vector.
         effects: shared effects of the runs on each floor.
     """
@@ -371,7 +374,7 @@ def _linear_draw(
     log_v: Variances,
     rng: np.random.Generator,
 ) -> LinearDraw:
-    """Return draws of steps 1 and 2 of a sweep."""
+    """Return draws of steps 1 and 2 of a sweep, that of the load biases' variance included."""
     first = part.given @ rng.standard_normal(len(part.pull))
     rows = {k: r.copy() for k, r in part.rows_at(log_v).items()}
     for r in rows.values():

@@ -101,25 +101,30 @@ def test_electric_draws_with_few_accepted_proposals_prevent_convergence(whole, m
 def test_uncertain_variances_widen_draws_of_the_motion_and_what_is_drawn_given_it(
     whole, monkeypatch
 ):
-    """The widened motion has the covariance that is added, and electric draws are given it."""
+    """Electric draws are given the widened motion, and widened themselves."""
     fit, plan, blocks, _ = whole
     motion, drawn, given = ~fit.space.electric, posterior.electric_given_motion, []
 
     def spied(first, second, covariance, x, *more):
-        given.append(x)
-        return drawn(first, second, covariance, x, *more)
+        given.append((x, drawn(first, second, covariance, x, *more)))
+        return given[-1][1]
 
     monkeypatch.setattr(posterior, "electric_given_motion", spied)
     found = []
     for size in (0.0, 1e-6):
-        added = size * np.outer(motion, motion) * np.eye(fit.space.size)
+        added = size * np.diag(np.where(motion, 1.0, 4.0))
         monkeypatch.setattr(posterior, "added_covariance", lambda *_, added=added: added)
         found.append(posterior.sampled(fit, plan, 400, blocks, QUIET))
     off = (found[1].z - found[0].z)[..., motion]
     np.testing.assert_allclose(off.std(axis=(0, 1)), 1e-3, rtol=0.12)
     assert np.abs(np.corrcoef(off.reshape(800, -1).T) - np.eye(motion.sum())).max() < 0.2
-    for posterior_, x in zip(found, given, strict=True):
-        np.testing.assert_array_equal(posterior_.z[..., motion], x)
+    for one, (x, _) in zip(found, given, strict=True):
+        np.testing.assert_array_equal(one.z[..., motion], x)
+    before, after = (
+        one.z[..., ~motion] - electric for one, (_, (electric, _)) in zip(found, given, strict=True)
+    )
+    assert not before.any()
+    np.testing.assert_allclose(after.std(axis=(0, 1)), 2e-3, rtol=0.12)
     np.testing.assert_array_equal(found[0].log_prob, found[1].log_prob)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from slipid.fitting.hierarchy import POOLED_RANGE, pooled_stds
+from slipid.fitting.hierarchy import POOLED_RANGE, pooled_stds, stds_given
 from slipid.fitting.problem import Problem
 from slipid.infer.posterior.blocks import ChainBlock
 from slipid.infer.posterior.sample import thinned
@@ -52,6 +52,22 @@ def test_the_std_of_load_biases_has_the_posterior_that_its_likelihood_gives(prob
         whole, first, second = moments(means)
         assert found.weight @ found.std == pytest.approx(first / whole, rel=near)
         assert found.weight @ found.std**2 == pytest.approx(second / whole, rel=near)
+
+
+def test_the_std_of_some_coordinates_has_all_others_integrated_out():
+    """Against the evidence of every candidate, from matrices of all coordinates."""
+    rng, at, typical = np.random.default_rng(2), np.array([1, 4]), 0.05
+    root = rng.standard_normal((6, 8))
+    precision, pull = 100 * root @ root.T, 100 * rng.standard_normal(6)
+    found = stds_given(precision, pull, at, typical)
+    log = []
+    for std in found.std:
+        whole = precision.copy()
+        whole[at, at] += std**-2
+        evidence = 0.5 * pull @ np.linalg.solve(whole, pull) - 0.5 * np.linalg.slogdet(whole)[1]
+        log.append(evidence - (len(at) - 1) * np.log(std) - 0.5 * (std / typical) ** 2)
+    weight = np.exp(log - np.max(log))
+    np.testing.assert_allclose(found.weight, weight / weight.sum(), rtol=1e-9)
 
 
 def test_thinned_draws_are_spread_over_steps_and_walkers_and_keep_their_log_density():
