@@ -26,7 +26,7 @@ from slipid.infer.design.planned_runs import PlannedRun
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import fit_with_noise, slopes
-from slipid.predict.folds import folds_of, inner_folds, problem_of_runs
+from slipid.predict.folds import folds_of, inner_folds, like_held_out, problem_of_runs
 from slipid.predict.predictive import ForceBalance, by_name, log_student
 from slipid.predict.ranking import ranking, transfer
 from slipid.predict.score import Score, forecast, mean_error
@@ -359,6 +359,20 @@ def test_a_model_that_tunes_itself_leaves_out_gaps_as_wide_as_the_one_it_is_aske
     for question in ("speeds", "random"):
         mine = folds_of(data, question)
         np.testing.assert_array_equal(inner_folds(data, question, np.flatnonzero(mine == 0)), mine)
+
+
+@pytest.mark.parametrize("question", ["sectors", "speeds", "random"])
+def test_runs_over_several_floors_are_held_out_with_runs_of_their_heading_or_speed(logs, question):
+    """The same runs, in another order, in two sets, one run of them without a command."""
+    data = collect(logs)
+    fold = folds_of(data, question)
+    wandering = replace(logs[0], twist_command=None)
+    others = [collect(logs[5:]), collect([*logs[:5], wandering])]
+    for k in sorted(set(fold[fold >= 0].tolist())):
+        found = like_held_out(data, np.flatnonzero(fold == k), others, question)
+        np.testing.assert_array_equal(found[:-1], np.concatenate([fold[5:], fold[:5]]) == k)
+        assert not found[-1]
+        assert found.any()
 
 
 def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):
