@@ -699,10 +699,10 @@ def compared(config, folder, monkeypatch):
         return fit(problem, keep=keep, **more)
 
     monkeypatch.setattr(compare, "optimise", spied)
-    wish = ("--data", folder / "logs", "--out", folder / "compared", "--folds", "random")
-    said = invoke("compare", config, *wish)
-    assert said.exit_code == 0, said.stderr
-    assert "is also fitted to runs over several floors (4)" in " ".join(said.stdout.split())
+    options = ("--data", folder / "logs", "--out", folder / "compared", "--folds", "random")
+    result = invoke("compare", config, *options)
+    assert result.exit_code == 0, result.stderr
+    assert "is also fitted to runs over several floors (4)" in " ".join(result.stdout.split())
     found = json.loads((folder / "compared/comparison.json").read_text())
     assert found["data"]["over_several_floors"] == {"runs": 4, "refused": None}
     folds = found["questions"]["random"]["folds"]
@@ -722,7 +722,8 @@ def compared(config, folder, monkeypatch):
         raise DataError("fitted again")
 
     monkeypatch.setattr(compare, "optimise", refusing)
-    assert "fitted again" in invoke("compare", config, *wish).stderr  # for another map
+    # with another map, fits in the folder are not used
+    assert "fitted again" in invoke("compare", config, *options).stderr
 
 
 def deployed(out):

@@ -264,7 +264,7 @@ def test_uncertain_variances_add_to_the_covariance_of_the_motion(problem, fitted
 
 
 def electric_excess(problem, fitted, larger):
-    """What the two sizes of the noise add to the covariance of electric parameters, in full."""
+    """Covariance that two sizes of the noise add to that of electric parameters."""
     part, e = linear_parts(problem, fitted)[1], problem.space.electric
     weight = weights_at(problem, fitted)
     found = []
