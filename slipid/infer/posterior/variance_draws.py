@@ -167,7 +167,9 @@ def conditional(
         log_v: log variances.
         some: indices of the coordinates in the search vector.
     """
-    precision, pull = part.prior_at(log_v)
+    precision, pull = part.precision.copy(), part.pull.copy()
+    if part.pooled is not None:
+        part.pooled.add(precision, pull, log_v)
     inverse = {
         k: np.linalg.inv(SegmentNoise.of(noise, part.degrees).covariance(log_v[None]))[:, 0]
         * weight[k][:, None, None]
@@ -380,13 +382,14 @@ def _linear_draw(
     for r in rows.values():
         r[..., -1] += r[..., :-1] @ first
     found = [floor_information(floor, rows, inverse, log_v) for floor in floors]
-    precision, pull = part.prior_at(log_v)
+    precision, pull = part.precision.copy(), part.pull.copy()
     for floor, info in zip(floors, found, strict=True):
         precision[np.ix_(floor.columns, floor.columns)] += info.rows[:-1, :-1]
         pull[floor.columns] -= info.rows[:-1, -1]
     log_v = log_v.copy()
     if part.pooled is not None:
-        _draw_pooled(part.pooled, precision, pull, log_v, rng)
+        log_v[part.pooled.number] = _pooled_draw(part.pooled, precision, pull, rng)
+        part.pooled.add(precision, pull, log_v)
     root = np.linalg.cholesky(precision)
     noise = solve_triangular(root, rng.standard_normal(len(pull)), lower=True, trans=1)
     change = np.where(part.given.any(axis=1), 0.0, cho_solve((root, True), pull) + noise)
@@ -400,26 +403,15 @@ def _linear_draw(
     return LinearDraw(log_v, first + change, effects)
 
 
-def _draw_pooled(
-    of: PooledPrior,
-    precision: Square,
-    pull: Search,
-    log_v: Variances,
-    rng: np.random.Generator,
-) -> None:
-    """Draw the variance of the load biases, with the change of the search vector integrated out.
+def _pooled_draw(
+    of: PooledPrior, precision: Square, pull: Search, rng: np.random.Generator
+) -> float:
+    """Return a draw of the log variance of the load biases, all changes integrated out.
 
-    The log variances are changed in place, and so are the precision and the pull of the change,
-    which contain the prior of the load biases.
+    The precision and the pull of the changes of the search vector lack the prior of load biases.
     """
-    before = np.exp(-log_v[of.number])
-    precision[of.at, of.at] -= before
-    pull[of.at] -= before * of.change
     found = stds_given(precision, pull - precision[:, of.at] @ of.change, of.at, of.typical)
-    std = rng.choice(found.std, p=found.weight)
-    precision[of.at, of.at] += std**-2
-    pull[of.at] += std**-2 * of.change
-    log_v[of.number] = 2 * np.log(std)
+    return float(2 * np.log(rng.choice(found.std, p=found.weight)))
 
 
 def _effect_draws(

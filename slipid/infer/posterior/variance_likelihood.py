@@ -66,15 +66,19 @@ class PooledPrior:
         number: index of this variance.
         at: indices of the load biases in the search vector.
         change: prior mean less fitted value of each load bias.
-        fitted: precision of the prior at the fit.
         typical: scale of the half-normal prior of the std.
     """
 
     number: int
     at: Int[np.ndarray, " bias"]
     change: Float[np.ndarray, " bias"]
-    fitted: float
     typical: float
+
+    def add(self, precision: Square, pull: Search, log_v: Variances) -> None:
+        """Add this prior to a precision and a pull, in place."""
+        own = np.exp(-log_v[self.number])
+        precision[self.at, self.at] += own
+        pull[self.at] += own * self.change
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +95,7 @@ class LinearPart:
             all other coordinates.
         shared: effects that the runs on each floor share.
         typical: centre of the prior of every log variance.
-        pooled: prior of the load biases, which `precision` and `pull` contain; None for residuals
+        pooled: prior of the load biases, which `precision` and `pull` lack; None for residuals
             that do not inform about them.
         voltages: as in `Voltages`; None without voltages.
         degrees: degrees of freedom of the Student t of a segment's residuals.
@@ -135,15 +139,6 @@ class LinearPart:
         """Return the log prior of each log variance, up to a constant."""
         return np.asarray(-0.5 * ((log_v - self.typical) / VARIANCE_SPREAD) ** 2)
 
-    def prior_at(self, log_v: Variances) -> tuple[Square, Search]:
-        """Return copies of `precision` and `pull`, with the drawn variance of the load biases."""
-        precision, pull, of = self.precision.copy(), self.pull.copy(), self.pooled
-        if of is not None:
-            more = np.exp(-log_v[of.number]) - of.fitted
-            precision[of.at, of.at] += more
-            pull[of.at] += more * of.change
-        return precision, pull
-
     def rows_at(self, log_v: Variances) -> Rows:
         """Return derivatives and residuals as in the likelihood, at given variances."""
         if self.voltages is None:
@@ -180,6 +175,8 @@ def linear_parts(problem: Problem, fitted: Fitted) -> tuple[LinearPart, ...]:
     e = problem.space.electric
     pull = precision @ (problem.space.prior_mean - z) + slope
     whole, whole_pull, several = precision.copy(), pull.copy(), fitted.multi_floor
+    pooled = _pooled_prior(problem, fitted)
+    whole[pooled.at, pooled.at], whole_pull[pooled.at] = 0.0, slope[pooled.at]
     if several is not None:
         linked = np.asarray(several.friction)
         whole[linked, linked], whole_pull[linked] = 0.0, 0.0
@@ -193,7 +190,7 @@ def linear_parts(problem: Problem, fitted: Fitted) -> tuple[LinearPart, ...]:
         np.zeros_like(precision),
         objective.shared,
         np.asarray(objective.typical),
-        _pooled_prior(problem, fitted),
+        pooled,
     )
     if "current" not in noises:
         return (motion,)
@@ -219,7 +216,6 @@ def _pooled_prior(problem: Problem, fitted: Fitted) -> PooledPrior:
         number=objective.pooled,
         at=at,
         change=(problem.space.prior_mean - fitted.z)[at],
-        fitted=float(np.exp(-fitted.log_variance[objective.pooled])),
         typical=float(np.exp(0.5 * objective.typical[objective.pooled])),
     )
 
