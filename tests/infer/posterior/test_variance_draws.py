@@ -53,7 +53,9 @@ def problem():
 
 @pytest.fixture(scope="module")
 def fitted(problem):
-    z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
+    """Return fitted values, with load biases that are not those of their prior."""
+    log_v = 2 * np.log(problem.noise.typical)
+    z = problem.space.start + np.where(problem.space.pooled, 0.1, 0.0)
     return Fitted(z, log_v, problem.laplace(z, log_v, np.ones(len(problem.windows))))
 
 
@@ -201,14 +203,20 @@ def test_the_std_of_load_biases_is_drawn_from_its_likelihood():
         pooled=PooledPrior(1, np.arange(4), -fitted, typical),
     )
     assert part.numbers.tolist() == [0, 1]
-    found = drawn(part, np.array([-60.0, 2 * np.log(now)]), 500)[..., 1]
+    start = np.array([-60.0, 2 * np.log(now)])
+    found = drawn(part, start, 500)[..., 1]
     grid = np.linspace(*np.array(POOLED_RANGE) * typical, 4000)
     spread = np.sqrt(grid[:, None] ** 2 + known**2)
     log = norm.logpdf(grid / typical) + norm.logpdf(measured, 0.0, spread).sum(axis=1)
     assert_quantiles(np.exp(0.5 * found), grid, log, effective=1500)
+    weight = np.exp(log - log.max())
+    shrunk = weight @ (1 / (1 + (known / grid) ** 2)) / weight.sum() * measured
+    states = islice(sweeps(part, start, 4, 10, np.random.default_rng(1)), 10, 510)
+    change = np.mean([at.change for at in states], axis=(0, 1))
+    np.testing.assert_allclose(fitted + change, shrunk, atol=4 * known / np.sqrt(2000))
 
 
-def dense_estimate(problem, part, weight, log_v):
+def dense_estimate(problem, part, weight, z, log_v):
     """Estimate of the change of the search vector and its covariance, from dense matrices."""
     rows = part.rows["motion"]
     n, m, columns = rows.shape
@@ -218,7 +226,7 @@ def dense_estimate(problem, part, weight, log_v):
         whole[k * m : (k + 1) * m, k * m : (k + 1) * m] += v
     flat = rows.reshape(n * m, columns)
     information = flat.T @ np.linalg.solve(whole, flat)
-    space, z = problem.space, problem.space.start
+    space = problem.space
     std = np.where(space.pooled, np.exp(0.5 * log_v[problem.objective.pooled]), space.prior_std)
     electric = problem.electric(z, problem.objective.typical)
     slope = log_jacobian(problem.objective, z, electric, np.ones(n))[1]
@@ -240,7 +248,7 @@ def test_uncertain_variances_add_to_the_covariance_of_the_motion(problem, fitted
     weight = weight * (DEGREES + count) / (DEGREES + count + 2)  # information of a Student t
     motion = ~problem.space.electric
     (first, before), (second, wide) = (
-        dense_estimate(problem, part, weight, v) for v in (fitted.log_variance, larger)
+        dense_estimate(problem, part, weight, fitted.z, v) for v in (fitted.log_variance, larger)
     )
     between = np.outer(second - first, second - first) / 4 * 120 / 119  # of 120 draws
     expected = (0.5 * (wide - before) + between)[np.ix_(motion, motion)]
