@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 from slipid.infer.posterior.surrogate import Matrix, Surrogate
 from slipid.support.extras import require
 
-FORMAT = 8
+FORMAT = 9
 """Version of the block files; it must be increased if their content or the algorithm changes."""
 LEAST_ROWS = 20
 """Smallest number of exact densities from which a surrogate is learnt."""
@@ -95,12 +95,12 @@ class Plan:
         block: number of steps in a block.
         warm_up: numbers of blocks after which the surrogate is learnt anew; the last number only
             ends the warm-up, since steps of Hamiltonian moves need some blocks to adapt to the
-            last surrogate.
+            last surrogate. A surrogate that makes the chain slow is learnt anew later, too.
         most: number of blocks after which sampling ends even without convergence.
         spread: distance from the fit up to which the first surrogate is learnt, and from which
             trajectories on it start [std]. A large distance finds modes away from the fit.
-        rows: number of exact densities from which the first surrogate is learnt, at least 20;
-            later ones are learnt from up to four times as many.
+        rows: largest number of exact densities from which the first surrogate is learnt, at least
+            20; surrogates of few terms need fewer, and later ones have up to four times as many.
         r_hat: upper limit of R-hat over ensembles for every coordinate.
         steps_per_tau: lower limit of steps per autocorrelation time for every coordinate.
         least_draws: lower limit of effective draws for every coordinate.
@@ -110,12 +110,12 @@ class Plan:
     ensembles: int = 4
     walkers: int = 8
     block: int = 20
-    warm_up: tuple[int, ...] = (1, 2, 4, 6)
+    warm_up: tuple[int, ...] = (1, 2, 4)
     most: int = 400
     spread: float = 2.0
     rows: int = 4500
     r_hat: float = 1.01
-    steps_per_tau: float = 50.0
+    steps_per_tau: float = 40.0
     least_draws: float = 1000.0
     seed: int = 0
 

@@ -23,7 +23,10 @@ the exact density (Metropolis-Hastings with independent proposals; Tierney 1994,
 Statistics 22(4)).
 """
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -128,7 +131,8 @@ class Density:
     def mapped(self, of: Callable[..., Result], *many: Any, floor: int | None = None) -> Result:
         """Return the results of a function of (density, anchor, element) for many elements.
 
-        The function is compiled once for all densities with the same coordinates.
+        The function is compiled once for all densities with the same coordinates. Chunks of many
+        elements are evaluated in parallel.
 
         Args:
             of: the function.
@@ -144,8 +148,19 @@ class Density:
             # Stored here, since the cache of JAX for compiled functions would never free it.
             form._each[of] = jax.jit(each)
         anchor = self.anchor if floor is None else self._on_floor[floor]
-        found: Result = form._each[of](anchor, many)
-        return found
+        mapped = partial(form._each[of], anchor)
+        count = len(jax.tree.leaves(many)[0])
+        if count < _PARALLEL:
+            found: Result = mapped(many)
+            return found
+        size = -(-count // _CHUNKS)
+        place = np.minimum(np.arange(_CHUNKS * size), count - 1).reshape(_CHUNKS, size)
+        chunks = [jax.tree.map(lambda x, at=at: x[at], many) for at in place]
+        first = mapped(chunks[0])  # compiles
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            rest = list(pool.map(mapped, chunks[1:]))
+        whole: Result = jax.tree.map(lambda *x: jnp.concatenate(x)[:count], first, *rest)
+        return whole
 
     def target(self) -> LogDensity:
         """Return the density as the sampler needs it."""
@@ -296,6 +311,8 @@ class Density:
         return HeldMotion(z, anchor.predict(robot, z).motor_force, more)
 
 
+_PARALLEL, _CHUNKS = 64, 8
+"""Least number of elements that are evaluated in parallel, and number of chunks of them."""
 _BATCH = 4
 """Number of vectors that are evaluated together."""
 _STEPS = 10

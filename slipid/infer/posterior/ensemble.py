@@ -38,6 +38,9 @@ RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister in NumPy's form."""
 USUAL_BLOCKS = 24
 """Number of blocks after the warm-up that are usually sufficient."""
+SLOW, LEAST_JUDGED, MOST_AGAIN = 40, 8, 3
+"""Number of blocks beyond which the surrogate is learnt anew if convergence would need them, number
+of blocks after which this is judged first, and largest number of such turns."""
 
 
 def extended(
@@ -55,50 +58,84 @@ def extended(
     report.stage(f"sampling {part}")
     learner, found = Learner(target, plan), _diagnosed(blocks, plan)
     while not (len(blocks) >= plan.most or (found and found.converged)):
-        block = _block(learner, blocks)
+        known = next((b.learnt for b in reversed(blocks) if b.learnt), None) or learner.first
+        block = _block(learner, blocks, known)
+        judged, count = _diagnosed([*blocks, block], plan), len(blocks) + 1
+        if count in plan.warm_up[:-1] or (judged and _slow(judged, blocks, plan)):
+            recent = [*blocks, block][_last_turn(blocks) :]
+            places = np.concatenate([b.chain for b in recent], axis=1)
+            block = replace(block, learnt=learner.next(known, places, count))
         blocks.append(block)
         if checkpoint:
             checkpoint.save(f"{part}-{block.number:04d}", packed(block))
-        found = _diagnosed(blocks, plan) or found
         what = f"block {len(blocks)}: {100 * block.accepted.mean():.0f} % moved"
-        if len(blocks) <= plan.warm_up[-1]:
+        warming = len(blocks) <= warm_up(blocks, plan)
+        found = None if warming else judged or found
+        if warming:
             what += f", warm-up, log density {block.log_prob[:, -1].mean():.1f}"
         elif found:
             what += f", {found.against(plan, target.names)}"
-        report.advance(len(blocks), _expected(len(blocks), found, plan), what)
+        report.advance(len(blocks), _expected(blocks, found, plan), what)
     return blocks
+
+
+def warm_up(blocks: Sequence[ChainBlock], plan: Plan) -> int:
+    """Return the number of blocks in the warm-up, which are discarded.
+
+    It ends some blocks after a surrogate was learnt for the last time.
+    """
+    settling = plan.warm_up[-1] - max((0, *plan.warm_up[:-1]))
+    return max(plan.warm_up[-1], _last_turn(blocks) + settling)
+
+
+def _last_turn(blocks: Sequence[ChainBlock]) -> int:
+    """Return the number of blocks after which a surrogate was learnt last, 0 for the first one."""
+    return max((b.number + 1 for b in blocks if b.learnt), default=0)
+
+
+def _slow(found: diagnosis.Diagnosis, blocks: Sequence[ChainBlock], plan: Plan) -> bool:
+    """Return True if the surrogate is to be learnt anew after the block that follows `blocks`.
+
+    Chains are slow where walkers stay at places that the surrogate describes badly. It is then
+    learnt from these places, too.
+    """
+    after = found.steps / plan.block
+    again = sum(b.learnt is not None for b in blocks) - len(plan.warm_up[:-1])
+    enough = len(blocks) + 2 * LEAST_JUDGED <= plan.most
+    judged = enough and after >= LEAST_JUDGED and again < MOST_AGAIN
+    return judged and found.excess * after > SLOW
 
 
 def _diagnosed(blocks: list[ChainBlock], plan: Plan) -> diagnosis.Diagnosis | None:
     """Return the convergence so far if it is to be judged after this number of blocks."""
-    after = len(blocks) - plan.warm_up[-1]
+    after = len(blocks) - warm_up(blocks, plan)
     # The check is slow, so it is done for every fourth block at first, and later less often.
     if after < 4 or after % max(4, 2 ** int(np.log2(after) - 3)):
         return None
     return diagnosis.diagnose(chain(blocks, plan), plan)
 
 
-def _expected(done: int, found: diagnosis.Diagnosis | None, plan: Plan) -> int:
+def _expected(blocks: Sequence[ChainBlock], found: diagnosis.Diagnosis | None, plan: Plan) -> int:
     """Return the number of blocks after which the chains will probably have converged.
 
     Effective draws grow in proportion to the steps.
     """
+    done, warm = len(blocks), warm_up(blocks, plan)
     if found is None:
-        return min(plan.most, max(done + 1, plan.warm_up[-1] + USUAL_BLOCKS))
+        return min(plan.most, max(done + 1, warm + USUAL_BLOCKS))
     # Without a single move the excess is infinite.
     after = np.nan_to_num(found.excess * found.steps / plan.block, nan=np.inf)
-    return int(min(plan.most, max(done + 1, plan.warm_up[-1] + after + 1)))
+    return int(min(plan.most, max(done + 1, warm + after + 1)))
 
 
 def chain(blocks: Sequence[ChainBlock], plan: Plan) -> Chain:
     """Return the positions of all walkers after the warm-up."""
-    return np.concatenate([b.chain for b in blocks[plan.warm_up[-1] :]], axis=1)
+    return np.concatenate([b.chain for b in blocks[warm_up(blocks, plan) :]], axis=1)
 
 
-def _block(learner: Learner, blocks: list[ChainBlock]) -> ChainBlock:
+def _block(learner: Learner, blocks: list[ChainBlock], known: Learnt) -> ChainBlock:
     """Sample the next block of a chain; the ensembles run in parallel threads."""
     target, plan = learner.target, learner.plan
-    known = next((b.learnt for b in reversed(blocks) if b.learnt), None) or learner.first
     states = _begin(plan, blocks, known)
     stop = threading.Event()
 
@@ -131,7 +168,7 @@ def _block(learner: Learner, blocks: list[ChainBlock]) -> ChainBlock:
         finally:
             stop.set()  # after an interrupt, all ensembles stop at their next step
     ends = [f.state for f in found]
-    block = ChainBlock(
+    return ChainBlock(
         number=len(blocks),
         chain=np.stack([f.places for f in found]),
         log_prob=np.stack([f.log_prob for f in found]),
@@ -142,11 +179,6 @@ def _block(learner: Learner, blocks: list[ChainBlock]) -> ChainBlock:
         accepted=np.array([f.moved for f in found]),
         learnt=None,
     )
-    if (count := len(blocks) + 1) not in plan.warm_up[:-1]:
-        return block
-    before = max((n for n in plan.warm_up if n < count), default=0)
-    recent = np.concatenate([b.chain for b in [*blocks[before:], block]], axis=1)
-    return replace(block, learnt=learner.next(known, recent, count))
 
 
 class _Walked(NamedTuple):

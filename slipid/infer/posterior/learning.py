@@ -7,7 +7,7 @@ there, its trajectories go there and the next one is corrected.
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, partial
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -22,6 +22,7 @@ from slipid.infer.posterior.surrogate import (
     Surrogate,
     gaussian_root,
     group_surrogate,
+    terms,
 )
 
 TARGET_FOLLOWED = 0.96
@@ -41,6 +42,13 @@ FROM_CHAIN = 1 / 3
 """Largest fraction of new rows that are positions of the chain."""
 NEAR, WIDE_SHARE = (0.05, 1.2), 0.15
 """Range of the squared scale of the first rows [std^2], and fraction of rows with other scales."""
+PER_TERM, FEW = 2.0, 500
+"""Number of rows per term of the polynomials with the most terms, and least number of rows, both
+limited by `Plan.rows`."""
+CLAIMED = 3.0
+"""Excess of the surrogate's log density above which walkers do not start at a place."""
+STRETCHED, STRETCH = 0.2, 3.0
+"""Fraction of new rows that are moved along weak coordinates, and largest distance [std]."""
 CHUNK = LEAST_ROWS
 """Number of vectors whose rows are evaluated and stored together."""
 LAPLACE_WEIGHT = 1e-3
@@ -58,6 +66,8 @@ class Learner:
     def __init__(self, target: LogDensity, plan: Plan):
         self.target, self.plan = target, plan
         self._kept: dict[bytes, list[ResidualRows]] = {}
+        most = max(terms(target.inputs(g), target.positive) for g in range(target.groups))
+        self._rows = min(plan.rows, max(round(PER_TERM * most), FEW))
 
     @cached_property
     def first(self) -> Learnt:
@@ -66,7 +76,7 @@ class Learner:
         Most rows are where it is plausible, others further away, where there may be other modes.
         """
         target, random = self.target, np.random.default_rng((self.plan.seed, 1, 0))
-        root, rows = gaussian_root(target.covariance, target.group), _whole(self.plan.rows)
+        root, rows = gaussian_root(target.covariance, target.group), _whole(self._rows)
         wide = random.uniform(size=rows) < WIDE_SHARE
         near, far = np.sqrt(random.uniform(*NEAR, rows)), random.uniform(0, self.plan.spread, rows)
         standard = random.standard_normal((rows, target.size))
@@ -84,9 +94,9 @@ class Learner:
         """
         random = np.random.default_rng((self.plan.seed, 1, number))
         places = chain.reshape(-1, self.target.size)
-        count = _whole(min(int(FROM_CHAIN * self.plan.rows), len(places)))
+        count = _whole(min(int(FROM_CHAIN * self._rows), len(places)))
         some = places[random.choice(len(places), count, replace=False)]
-        design = np.concatenate([known.design, some])[-_whole(KEPT_TURNS * self.plan.rows) :]
+        design = np.concatenate([known.design, some])[-_whole(KEPT_TURNS * self._rows) :]
         frame = known.surrogate.centre, known.surrogate.root
         return self._turn(design, chain[:, -1], frame, known.step, random)
 
@@ -99,38 +109,63 @@ class Learner:
         random: np.random.Generator,
     ) -> Learnt:
         """Return the surrogate fitted to a design, to which draws of the surrogate are added."""
-        target, plan = self.target, self.plan
+        target = self.target
         prior = target.prior_mean, target.prior_std, target.link, target.link_centre
         surrogate = Surrogate(self._fitted(design), target.group, *prior, *frame)
-        x, step, drawn = start, step.copy(), []
-        calls = -(-plan.rows // (ROUNDS * plan.ensembles * plan.walkers))
+        x, step, drawn = start.reshape(-1, target.size), step.copy(), []
+        calls = -(-self._rows // (ROUNDS * len(x)))
         of_family = families(target)
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, plan.ensembles)) as pool:
-            for _ in range(ROUNDS):
-                # all coordinates last, whose draws spread furthest
-                turns = [k for k in range(1, len(of_family)) for _ in range(max(2, calls // 4))]
-                for k in [*turns, *[0] * calls]:
-                    keys = jax.random.split(jax.random.key(random.integers(2**31)), len(x))
-                    ends = partial(
-                        wander,
-                        surrogate,
-                        family=of_family[k],
-                        step=float(step[k]),
-                        learning=1.0,
-                    )
-                    found = list(pool.map(lambda x, key, ends=ends: ends(x=x, key=key), x, keys))
-                    x = np.stack([np.asarray(f.x) for f in found])
-                    drawn.append(x.reshape(-1, target.size))
-                    off = np.mean([float(f.followed) for f in found]) - TARGET_FOLLOWED
-                    step[k] = np.clip(step[k] * np.exp(ADAPTION * off), LEAST_STEP, MOST_STEP)
-                last = np.concatenate(drawn[-calls:])
-                spread = np.cov(last.T) / TEMPERATURE + LAPLACE_WEIGHT * target.covariance
-                root = gaussian_root(np.atleast_2d(spread), target.group)
-                surrogate = surrogate._replace(centre=last.mean(axis=0), root=root)
+        for _ in range(ROUNDS):
+            # all coordinates last, whose draws spread furthest
+            turns = [k for k in range(1, len(of_family)) for _ in range(max(2, calls // 4))]
+            for k in [*turns, *[0] * calls]:
+                key = jax.random.key(random.integers(2**31))
+                found = wander(surrogate, x, of_family[k], float(step[k]), key, learning=1.0)
+                x = np.asarray(found.x)
+                drawn.append(x)
+                off = float(found.followed) - TARGET_FOLLOWED
+                step[k] = np.clip(step[k] * np.exp(ADAPTION * off), LEAST_STEP, MOST_STEP)
+            last = np.concatenate(drawn[-calls:])
+            spread = np.cov(last.T) / TEMPERATURE + LAPLACE_WEIGHT * target.covariance
+            root = gaussian_root(np.atleast_2d(spread), target.group)
+            surrogate = surrogate._replace(centre=last.mean(axis=0), root=root)
         more = np.concatenate(drawn)
-        count = _whole(min(plan.rows, len(more)))
+        count = _whole(min(self._rows, len(more)))
         more = more[random.choice(len(more), count, replace=False)]
-        return Learnt(surrogate, step, np.concatenate([design, more]), x)
+        self._stretch(more, surrogate, random)
+        places = self._plausible(x, surrogate, random).reshape(start.shape)
+        return Learnt(surrogate, step, np.concatenate([design, more]), places)
+
+    def _plausible(self, x: Matrix, surrogate: Surrogate, random: np.random.Generator) -> Matrix:
+        """Return draws of the surrogate, some replaced by others.
+
+        Those are replaced where the surrogate claims a density that is not there. From there,
+        Hamiltonian moves on it would not return.
+        """
+        excess = self.target.terms(x).sum(axis=1) - surrogate.value(x)
+        finite = excess[np.isfinite(excess)]
+        usual = np.median(finite) if len(finite) else 0.0
+        good = np.flatnonzero(np.log(random.uniform(size=len(x))) < excess - usual + CLAIMED)
+        if not len(good):
+            return x
+        out = x[random.choice(good, len(x))]
+        out[good] = x[good]
+        return out
+
+    def _stretch(self, rows: Matrix, surrogate: Surrogate, random: np.random.Generator) -> None:
+        """Move some rows, in place, along the inputs of the surrogate that are known worst.
+
+        The other coordinates follow by regression. Without such rows, the tail of a density that a
+        surrogate misses would not be found, since no trajectory on it goes there.
+        """
+        covariance = surrogate.root @ surrogate.root.T
+        worst = [of.inputs.at[k] for of in surrogate.groups for k in np.unique(of.inputs.wide)]
+        if not worst:
+            return
+        count = int(STRETCHED * len(rows))
+        which = random.choice(np.unique(worst), count)
+        along = covariance[which] / np.sqrt(np.diag(covariance)[which])[:, None]
+        rows[:count] += random.uniform(-STRETCH, STRETCH, (count, 1)) * along
 
     def _fitted(self, design: Matrix) -> tuple[GroupSurrogate, ...]:
         """Return the surrogate of every group, fitted to the exact rows of a design."""

@@ -25,7 +25,7 @@ from slipid.infer.posterior.surrogate import Matrix, Surrogate
 
 ALONG, DIFFERENTIAL, HAMILTONIAN = 0.15, 0.1, 0.75
 """Relative frequencies of coordinate walks, differential and Hamiltonian moves."""
-OF_ALL = 0.7
+OF_ALL = 0.85
 """Fraction of moves that change all coordinates, if groups share some."""
 ALONE_SHARE = 0.5
 """Fraction of coordinate walks along a coordinate of x; others are along one of the Gaussian."""
@@ -244,10 +244,8 @@ def wander(
         return _Phase(u, p, cool * value, cool * found.slope @ surrogate.root * free)
 
     def trajectory(start: _Phase, key: Array) -> tuple[_Phase, Array]:
-        of_momentum, of_step, of_end = jax.random.split(key, 3)
+        of_momentum, of_end = jax.random.split(key)
         start = start._replace(p=jax.random.normal(of_momentum, start.u.shape) * free)
-        rare = jax.random.uniform(of_step, start.value.shape) ** RARITY
-        h = step * SHORTEST**rare @ onto.T
 
         def leap(now: _Phase, _: None) -> tuple[_Phase, None]:
             half = now.p + 0.5 * h * now.slope
@@ -263,9 +261,12 @@ def wander(
         u, slope = (jnp.where(moved, a, b) for a, b in ((end.u, start.u), (end.slope, start.slope)))
         return _Phase(u, end.p, jnp.where(took, end.value, start.value), slope), share
 
+    of_step, of_trajectories = jax.random.split(key)
+    rare = jax.random.uniform(of_step, (len(x), len(index))) ** RARITY
+    h = step * SHORTEST**rare @ onto.T
     u = jnp.linalg.solve(surrogate.root, (x - surrogate.centre).T).T
     first = at(u, jnp.zeros_like(u))
-    last, share = jax.lax.scan(trajectory, first, jax.random.split(key, TRAJECTORIES))
+    last, share = jax.lax.scan(trajectory, first, jax.random.split(of_trajectories, TRAJECTORIES))
     moved = free * (last.u != u).any(axis=1, keepdims=True) > 0
     ends = jnp.where(moved, surrogate.centre + last.u @ surrogate.root.T, x)
     return Wandered(ends, first.value, last.value, jnp.mean(share))

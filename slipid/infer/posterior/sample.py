@@ -9,7 +9,9 @@ most likely values. The friction that moves runs over several floors is sampled 
 """
 
 import tempfile
+import threading
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,13 +62,20 @@ def sampled(
     problem, fitted = around(required(fit.problem), Fitted.of(fit))
     parts = (EVERYTHING,) if problem.objective.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
-    blocks = ensemble.extended(first.target(), plan, parts[0], checkpoint, report)
+    shape = (plan.ensembles, draws)
+    stop = threading.Event()
+    with ThreadPoolExecutor(1) as pool:  # beside the chain, which leaves a core idle at times
+        variances = pool.submit(drawn_variances, problem, fitted, shape, plan.seed, stop=stop)
+        try:
+            blocks = ensemble.extended(first.target(), plan, parts[0], checkpoint, report)
+            if not variances.done():
+                report.stage("drawing the variances of the noise")
+            log_variance = variances.result()
+        finally:
+            stop.set()
     chain = ensemble.chain(blocks, plan)
     found = diagnosis.diagnose(chain, plan)
-    x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)
-    shape = (plan.ensembles, draws)
-    report.stage("drawing the variances of the noise", usual_s=COMPILING_S)
-    log_variance = drawn_variances(problem, fitted, shape, plan.seed)
+    x, log_prob = thinned(chain, blocks[ensemble.warm_up(blocks, plan) :], draws)
     # The chain has the variances of the fit; their uncertainty adds to that of the parameters.
     added = added_covariance(problem, fitted, log_variance)
     rng = np.random.default_rng([plan.seed, 2])

@@ -28,7 +28,7 @@ from slipid.infer.posterior.variance_draws import (
 from slipid.infer.verdicts.draws import Draws
 from slipid.support.progress import Reporter
 
-SHORT = Plan(ensembles=2, walkers=32, block=16, warm_up=(1, 2), most=5, rows=1200, spread=1.0)
+SHORT = Plan(ensembles=2, walkers=32, block=16, warm_up=(1, 2), most=5, rows=2000, spread=1.0)
 """Settings of the sampler: the surrogate is learnt twice, and three blocks are kept.
 
 With four, `ensemble` would judge their convergence, for which it needs packages of an extra."""

@@ -19,6 +19,7 @@ that is, up to the fourth degree in w and up to the second in the other inputs.
 
 from collections.abc import Sequence
 from itertools import combinations_with_replacement, pairwise
+from math import comb
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -29,13 +30,14 @@ from jaxtyping import Array, Bool, Float, Int
 Matrix = Float[np.ndarray, "_ _"]
 Numbers = TypeVar("Numbers", Array, np.ndarray)
 """Array of JAX, or of NumPy, for which JAX compiles nothing."""
-MOST_COMPONENTS = 64
-"""Number of principal components of the residuals of a group; spare ones are zero."""
+MOST_COMPONENTS, SPARE = 64, 16
+"""Largest number of principal components of the residuals of a group, and number of which their
+number is a multiple, so that surrogates share compiled functions; spare ones are zero."""
 LEAST_VARIANCE = 1e-4
 """Variance of a component below which it is left out."""
-MOST_WIDE = 6
+MOST_WIDE = 8
 """Largest number of inputs that have terms of up to the fourth degree."""
-UPPER_END = 2.0
+UPPER_END = 1.0
 """Distance of log q above the mean of x [std]."""
 PLAUSIBLE = 12.0
 """Loss of log density, beyond the usual one, up to which a row is plausible."""
@@ -176,6 +178,10 @@ class Surrogate(NamedTuple):
         of_prior = -pull / self.prior_std - linked @ self.link
         return ValueAndSlope(terms, sum((of.slope for of in of_groups), of_prior))
 
+    def value(self, x: Matrix) -> Float[np.ndarray, " walker"]:
+        """Return the approximate log density of every walker."""
+        return np.asarray(_value(self, x))
+
     @staticmethod
     def of_leaves(leaves: Sequence[np.ndarray], groups: int) -> "Surrogate":
         """Return the surrogate whose arrays `jax.tree.leaves` has listed."""
@@ -187,6 +193,11 @@ class Surrogate(NamedTuple):
             for inputs, rest in zip(parts[::2], parts[1::2], strict=True)
         ]
         return Surrogate(tuple(each), *leaves[ends[-1] :])
+
+
+@jax.jit
+def _value(surrogate: Surrogate, x: Array) -> Float[Array, " walker"]:
+    return surrogate.with_slope(x).value.sum(axis=1)
 
 
 class ResidualRows(NamedTuple):
@@ -275,6 +286,14 @@ def _inputs(
     return found._replace(mean=mean, std=np.sqrt(weight @ (plain - mean) ** 2))
 
 
+def terms(of: Int[np.ndarray, "2 input"], positive: Bool[np.ndarray, " size"]) -> int:
+    """Return the number of terms of each polynomial; arguments are those of `group_surrogate`."""
+    inputs, wide = of.shape[1], min(MOST_WIDE, int(positive[of[0]].sum()))
+    others, products = inputs - wide, wide * (wide + 1) // 2
+    third, fourth = comb(wide + 2, 3) + others * products, comb(wide + 3, 4)
+    return 1 + inputs + comb(inputs + 1, 2) + third + fourth
+
+
 def _pairs(inputs: PolynomialInputs) -> Int[np.ndarray, "2 term"]:
     """Return pairs of elements of v, one for each different product of inputs."""
     factors = [(k,) for k in range(len(inputs.at))] + [tuple(p) for p in inputs.wide.T.tolist()]
@@ -285,16 +304,18 @@ def _pairs(inputs: PolynomialInputs) -> Int[np.ndarray, "2 term"]:
 
 
 def _components(rows: Matrix) -> Float[np.ndarray, "m component"]:
-    """Return the directions of the largest variance, `MOST_COMPONENTS` of them.
+    """Return the directions of the largest variance, at most `MOST_COMPONENTS` of them.
 
-    Directions of less than `LEAST_VARIANCE` are zero. Source: Halko, Martinsson and Tropp 2011,
+    Directions of less than `LEAST_VARIANCE` are left out. Source: Halko, Martinsson and Tropp 2011,
     SIAM Review 53(2), algorithm 5.1 after one power iteration.
     """
     start = np.random.default_rng(0).standard_normal((rows.shape[1], 2 * MOST_COMPONENTS))
     basis = np.linalg.qr(rows.T @ (rows @ (rows.T @ (rows @ start))))[0]
     value, inner = np.linalg.eigh((rows @ basis).T @ (rows @ basis))
-    found = (basis @ inner * (value > LEAST_VARIANCE))[:, ::-1][:, :MOST_COMPONENTS]
-    return np.pad(found, ((0, 0), (0, MOST_COMPONENTS - found.shape[1])))
+    found = (basis @ inner * (value > LEAST_VARIANCE))[:, ::-1]
+    count = min(int((value > LEAST_VARIANCE).sum()), MOST_COMPONENTS)
+    padded = max(SPARE, -(-count // SPARE) * SPARE)
+    return np.pad(found[:, :count], ((0, 0), (0, padded - count)))
 
 
 def gaussian_root(covariance: Matrix, group: Int[np.ndarray, " size"]) -> Matrix:

@@ -23,7 +23,9 @@ infinity if other variances can explain the residuals.
 """
 
 import math
+import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice, pairwise
@@ -55,7 +57,7 @@ from slipid.infer.posterior.variance_likelihood import (
     target,
 )
 
-_SWEEPS, _WORK = (100, 400), 7e6
+_SWEEPS, _WORK = (100, 150), 7e6
 """Least and largest number of sweeps from which draws are taken, and the number of elements of the
 segments' covariances in all of them together, if the number of sweeps is between these."""
 _WARM_UP = 0.4
@@ -77,13 +79,21 @@ _LEAST_EIGENVALUE = 1e-9
 
 
 def drawn_variances(
-    problem: Problem, fitted: Fitted, shape: tuple[int, int], seed: int, of_motion: bool = False
+    problem: Problem,
+    fitted: Fitted,
+    shape: tuple[int, int],
+    seed: int,
+    of_motion: bool = False,
+    stop: threading.Event | None = None,
 ) -> Float[np.ndarray, "ensemble draw variance"]:
     """Return draws of the log variances, from a chain for each ensemble.
 
     Draws are spread evenly over the sweeps of a chain; if there are more draws than sweeps, some
     sweeps count several times. With `of_motion`, the variances of currents and voltages stay as
     fitted.
+
+    Raises:
+        CancelledError: `stop` was set by another thread.
     """
     rng, log_v = np.random.default_rng([seed, 1]), fitted.log_variance
     out = np.broadcast_to(log_v, (*shape, len(log_v))).copy()
@@ -91,8 +101,12 @@ def drawn_variances(
     for part in linear_parts(problem, fitted)[: 1 if of_motion else None]:
         number = int(np.clip(_WORK / part.elements, *_SWEEPS))
         first = int(_WARM_UP * number)
-        found = islice(sweeps(part, log_v, shape[0], first, rng), first, first + number)
-        chain = np.stack([at.log_variance for at in found], axis=1)[..., part.numbers]
+        walked = []
+        for at in islice(sweeps(part, log_v, shape[0], first, rng), first + number):
+            if stop is not None and stop.is_set():
+                raise CancelledError
+            walked.append(at.log_variance)
+        chain = np.stack(walked[first:], axis=1)[..., part.numbers]
         out[..., part.numbers] = chain[:, (spread * number).astype(int)]
     return out
 

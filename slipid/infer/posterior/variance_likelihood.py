@@ -5,7 +5,6 @@ matrix, as in the fit. The arrays are those of numpy, since its batched inverses
 compiled ones, and have a first axis for chains.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -313,38 +312,38 @@ class SegmentNoise:
 def _of_voltages(
     voltages: Voltages, noises: Noises, degrees: float, r: Array, more: Array, log_v: Array
 ) -> tuple[Array, Array]:
-    """Return the log likelihood of a chain's voltages, and its derivative by the log variances."""
+    """Return the log likelihood of every chain's voltages, and its derivative by log variances."""
 
-    def log_likelihood(log_v: Array) -> Array:
+    def log_likelihood(r: Array, more: Array, log_v: Array) -> Array:
         share, spread = voltages.share_and_spread(noises, log_v)
         variance = jnp.diagonal(noises["voltage"].covariance(log_v), axis1=-2, axis2=-1)
         square = jnp.sum(((r + share * more) / spread) ** 2 / variance, axis=1)
         tail = (degrees + noises["voltage"].count) * jnp.log1p(square / degrees)
         return -jnp.sum(jnp.log(spread) + 0.5 * jnp.log(variance)) - 0.5 * jnp.sum(tail)
 
-    return jax.value_and_grad(log_likelihood)(log_v)
+    return jax.vmap(jax.value_and_grad(log_likelihood, argnums=2))(r, more, log_v)
 
 
 def target(part: LinearPart, noises: dict[str, SegmentNoise], at: Residuals) -> SlopedDensity:
     """Return the density of the log variances given residuals, with the weights integrated out."""
 
-    def of_voltages(log_v: Chains) -> Iterator[tuple[Array, Array]]:
+    def of_voltages(log_v: Chains) -> tuple[Array, Array]:
         if part.voltages is None or at.more is None:
-            return
-        for r, more, one in zip(at.blocks["voltage"], at.more, log_v, strict=True):
-            yield _of_voltages(part.voltages, part.noises, part.degrees, r, more, one)
+            return jnp.zeros(len(log_v)), jnp.zeros_like(log_v)
+        of = (jnp.asarray(x) for x in (at.blocks["voltage"], at.more, log_v))
+        return _of_voltages(part.voltages, part.noises, part.degrees, *of)
 
     def log_density(log_v: Chains) -> np.ndarray:
-        out = part.log_prior(log_v).sum(axis=1)
-        out += sum(
-            n.log_likelihood(at.blocks[k], log_v) for k, n in noises.items() if k != "voltage"
-        )
-        return out + np.array([float(value) for value, _ in of_voltages(log_v)] or 0.0)
+        out = part.log_prior(log_v).sum(axis=1) + np.asarray(of_voltages(log_v)[0])
+        for k, n in noises.items():
+            out += n.log_likelihood(at.blocks[k], log_v) if k != "voltage" else 0.0
+        return out
 
     def slope(log_v: Chains) -> np.ndarray:
-        out = (part.typical - log_v) / VARIANCE_SPREAD**2
-        out += sum(n.slope(at.blocks[k], log_v) for k, n in noises.items() if k != "voltage")
-        return out + np.array([np.asarray(by) for _, by in of_voltages(log_v)] or 0.0)
+        out = (part.typical - log_v) / VARIANCE_SPREAD**2 + np.asarray(of_voltages(log_v)[1])
+        for k, n in noises.items():
+            out += n.slope(at.blocks[k], log_v) if k != "voltage" else 0.0
+        return out
 
     return SlopedDensity(log_density, slope)
 

@@ -10,7 +10,7 @@ from arviz_stats.base import array_stats
 
 from slipid.infer.posterior.blocks import LogDensity, Plan
 from slipid.infer.posterior.diagnosis import autocorrelation_time, diagnose
-from slipid.infer.posterior.ensemble import _begin, extended
+from slipid.infer.posterior.ensemble import _begin, extended, warm_up
 from slipid.infer.posterior.ensemble import chain as positions
 from slipid.infer.posterior.proposals import DifferentialEvolution, families
 from slipid.support.progress import Reporter
@@ -208,6 +208,20 @@ def test_an_interrupted_chain_continues_like_an_uninterrupted_one():
         for one, other in zip(again, whole, strict=True):
             np.testing.assert_array_equal(one.chain, other.chain)
             np.testing.assert_array_equal(one.log_prob, other.log_prob)
+
+
+@pytest.mark.slow
+def test_a_slow_chain_begins_again_with_a_new_surrogate_though_it_is_interrupted():
+    target, _, _ = banana()
+    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=29, rows=200)
+    plan = replace(plan, least_draws=1e6)
+    whole = run(target, plan)
+    assert [b.number + 1 for b in whole if b.learnt] == [1, 10]  # eight blocks after the warm-up
+    assert warm_up(whole, plan) == 11
+    assert positions(whole, plan).shape[1] == 18 * 5
+    for stop in (5, 10, 11):
+        again = run(target, plan, whole[:stop])
+        np.testing.assert_array_equal(positions(again, plan), positions(whole, plan))
 
 
 @pytest.mark.slow

@@ -11,14 +11,20 @@ from emcee.model import Model
 from emcee.state import State
 
 from slipid.infer.posterior.blocks import ChainBlock, Learnt, Plan, packed, unpacked
-from slipid.infer.posterior.learning import Learner
+from slipid.infer.posterior.learning import STRETCHED, Learner
 from slipid.infer.posterior.proposals import (
     CoordinateWalk,
     DifferentialEvolution,
     Hamiltonian,
     families,
 )
-from slipid.infer.posterior.surrogate import ResidualRows, gaussian_root, group_surrogate
+from slipid.infer.posterior.surrogate import (
+    ResidualRows,
+    _pairs,
+    gaussian_root,
+    group_surrogate,
+    terms,
+)
 from tests.infer.posterior.test_ensemble import gaussian, plateau
 
 pytestmark = pytest.mark.slow
@@ -194,3 +200,44 @@ def test_a_quotient_that_alone_matters_is_an_input():
         return np.std(value - new.log_likelihood)
 
     assert error([(0, -1), (1, -1), (0, 1)]) < 0.5 * error([(0, -1), (1, -1)])
+
+
+def test_terms_are_counted_as_they_are_fitted():
+    random, size = np.random.default_rng(0), 11
+    x = random.standard_normal((400, size))
+    of, positive = np.array([np.arange(size), np.full(size, -1)]), np.arange(size) != 4
+    for some in (slice(None), slice(4, 8)):
+        found = group_surrogate(ResidualRows(x, x, np.zeros(400)), of[:, some], positive, size)
+        assert terms(of[:, some], positive) == 1 + len(of[0, some]) + len(_pairs(found.inputs)[0])
+
+
+def test_walkers_do_not_start_where_the_surrogate_claims_too_much(exact):
+    target, learnt, x, _ = exact
+    places, false = x[:64], x[:64, 0] > np.quantile(x[:64, 0], 0.8)
+
+    def lower(x):
+        return target.terms(x) - 300.0 * (x[:, :1] > places[~false, 0].max())
+
+    learner = Learner(replace(target, terms=lower), PLAN)
+    new = learner._plausible(places, learnt.surrogate, np.random.default_rng(0))
+    stays = (new == places).all(axis=1)
+    assert not stays[false].any()
+    assert stays[~false].mean() > 0.9
+    assert (new[:, 0] <= places[~false, 0].max()).all()
+    nowhere = Learner(replace(target, terms=lambda x: np.full((len(x), 3), -np.inf)), PLAN)
+    kept = nowhere._plausible(places, learnt.surrogate, np.random.default_rng(0))
+    np.testing.assert_array_equal(kept, places)
+
+
+def test_some_rows_are_moved_along_weak_coordinates():
+    target, _, _ = plateau()
+    learner = Learner(target, PLAN)
+    surrogate = learner.first.surrogate
+    rows = np.zeros((1000, 2))
+    learner._stretch(rows, surrogate, np.random.default_rng(0))
+    moved = rows[: int(1000 * STRETCHED)]
+    assert not rows[len(moved) :].any()
+    covariance = surrogate.root @ surrogate.root.T
+    std = np.sqrt(covariance[0, 0])  # of the positive coordinate
+    assert 2.8 < np.abs(moved[:, 0]).max() / std <= 3.0
+    np.testing.assert_allclose(moved[:, 1], moved[:, 0] * covariance[0, 1] / std**2)
