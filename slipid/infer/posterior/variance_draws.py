@@ -57,9 +57,10 @@ from slipid.infer.posterior.variance_likelihood import (
     target,
 )
 
-_SWEEPS, _WORK = (100, 150), 7e6
-"""Least and largest number of sweeps from which draws are taken, and the number of elements of the
-segments' covariances in all of them together, if the number of sweeps is between these."""
+_LEAST_SWEEPS, _STATES, _WORK = 100, 600, 7e6
+"""Least number of sweeps of a chain from which draws are taken, largest number of those of all
+chains together, and number of elements of the segments' covariances in the sweeps of a chain, if
+their number is between these."""
 _WARM_UP = 0.4
 """Number of sweeps before the first draw, per sweep from which draws are taken."""
 _PSEUDO = 20
@@ -99,7 +100,8 @@ def drawn_variances(
     out = np.broadcast_to(log_v, (*shape, len(log_v))).copy()
     spread = (np.arange(shape[1]) + 0.5) / shape[1]
     for part in linear_parts(problem, fitted)[: 1 if of_motion else None]:
-        number = int(np.clip(_WORK / part.elements, *_SWEEPS))
+        most = max(_LEAST_SWEEPS, _STATES // shape[0])
+        number = int(np.clip(_WORK / part.elements, _LEAST_SWEEPS, most))
         first = int(_WARM_UP * number)
         walked = []
         for at in islice(sweeps(part, log_v, shape[0], first, rng), first + number):
