@@ -94,7 +94,7 @@ def by_slipid(density):
     times, report = [time.perf_counter()], Reporter(quiet=True)
     report.advance = lambda *_: times.append(time.perf_counter())
     blocks = sampler.extended(target, plan, MOTION, None, report)
-    warm = plan.warm_up[-1]
+    warm = sampler.warm_up(blocks, plan)
     chain = sampler.chain(blocks, plan)
     found = diagnose(chain, plan)
     print(f"slipid: {found.steps} steps, R-hat {found.r_hat.max():.4f}, {found.converged=}")

@@ -135,7 +135,8 @@ def whole():
     plan = Plan(ensembles=2, walkers=6, block=5, warm_up=(1, 2), most=4, rows=200)
     blocks = Memory()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("slipid.infer.posterior.variance_draws._SWEEPS", (10, 10))
+        for number in ("_LEAST_SWEEPS", "_STATES"):
+            patch.setattr(f"slipid.infer.posterior.variance_draws.{number}", 10)
         found = posterior.sampled(fit, plan, 10, blocks, QUIET)
         assert [part for part, _ in blocks.blocks] == [MOTION] * 4
         yield fit, plan, blocks, found

@@ -334,7 +334,8 @@ def test_voltages_depend_on_the_variances_as_in_the_fit(problem, fitted):
 def test_draws_are_reproducible_and_differ_between_ensembles_and_seeds(
     problem, fitted, monkeypatch
 ):
-    monkeypatch.setattr("slipid.infer.posterior.variance_draws._SWEEPS", (10, 10))
+    for number in ("_LEAST_SWEEPS", "_STATES"):
+        monkeypatch.setattr(f"slipid.infer.posterior.variance_draws.{number}", 10)
     one, again, other = (drawn_variances(problem, fitted, (2, 10), seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, again)
     assert (one[0] != one[1]).any(axis=0).all()
