@@ -2,8 +2,9 @@
 
 Walkers of one ensemble depend on each other, so that convergence is judged between ensembles.
 During the warm-up, which is discarded, a surrogate is learnt from the positions of all ensembles
-and from draws of the surrogate before; after the warm-up it stays fixed. The content of a block and
-the end of sampling depend on earlier blocks only, so that a continued chain equals an uninterrupted
+and from draws of the surrogate before; after the warm-up it stays fixed. If the chain is slow then,
+it becomes a part of the warm-up, and the surrogate is learnt again. The content of a block and the
+end of sampling depend on earlier blocks only, so that a continued chain equals an uninterrupted
 one.
 """
 
@@ -38,9 +39,9 @@ RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister in NumPy's form."""
 USUAL_BLOCKS = 24
 """Number of blocks after the warm-up that are usually sufficient."""
-SLOW, LEAST_JUDGED, MOST_AGAIN = 40, 8, 3
-"""Number of blocks beyond which the surrogate is learnt anew if convergence would need them, number
-of blocks after which this is judged first, and largest number of such turns."""
+SLOW, JUDGED, MOST_AGAIN = 40, (160, 640), 3
+"""Number of steps of a walker for an effective draw beyond which the surrogate is learnt anew, range
+of steps after the warm-up in which this is judged, and largest number of such turns."""
 
 
 def extended(
@@ -57,7 +58,9 @@ def extended(
         report.line(f"continuing from block {len(blocks)} ({part}) of {checkpoint.folder}")
     report.stage(f"sampling {part}")
     learner, found = Learner(target, plan), _diagnosed(blocks, plan)
-    while not (len(blocks) >= plan.most or (found and found.converged)):
+    while not (found and found.converged) and len(blocks) < max(
+        plan.most, warm_up(blocks, plan) + 1
+    ):
         known = next((b.learnt for b in reversed(blocks) if b.learnt), None) or learner.first
         block = _block(learner, blocks, known)
         judged, count = _diagnosed([*blocks, block], plan), len(blocks) + 1
@@ -96,14 +99,13 @@ def _last_turn(blocks: Sequence[ChainBlock]) -> int:
 def _slow(found: diagnosis.Diagnosis, blocks: Sequence[ChainBlock], plan: Plan) -> bool:
     """Return True if the surrogate is to be learnt anew after the block that follows `blocks`.
 
-    Chains are slow where walkers stay at places that the surrogate describes badly. It is then
-    learnt from these places, too.
+    Chains are slow if walkers stay at places that the surrogate describes badly, from which it is
+    then learnt, too. The largest number of blocks has no influence, as it may be increased later.
     """
-    after = found.steps / plan.block
     again = sum(b.learnt is not None for b in blocks) - len(plan.warm_up[:-1])
-    enough = len(blocks) + 2 * LEAST_JUDGED <= plan.most
-    judged = enough and after >= LEAST_JUDGED and again < MOST_AGAIN
-    return judged and found.excess * after > SLOW
+    if found.converged or again >= MOST_AGAIN or not JUDGED[0] <= found.steps <= JUDGED[1]:
+        return False
+    return found.steps * plan.ensembles * plan.walkers > SLOW * found.ess.min()
 
 
 def _diagnosed(blocks: list[ChainBlock], plan: Plan) -> diagnosis.Diagnosis | None:

@@ -1,4 +1,4 @@
-"""Learning of the surrogate that Hamiltonian moves follow, in turns during the warm-up.
+"""Learning of the surrogate that Hamiltonian moves follow, in turns.
 
 In every turn the surrogate is fitted to exact rows, and Hamiltonian trajectories on it then give
 vectors whose exact rows are added for the next turn. Where a surrogate claims a density that is not
@@ -37,7 +37,7 @@ ADAPTION = 2.0
 ROUNDS = 3
 """Number of times that step and Gaussian are adapted to a new surrogate."""
 KEPT_TURNS = 4
-"""The surrogate is fitted to at most this many times `Plan.rows` rows, the latest ones."""
+"""The surrogate is fitted to at most this many times the first number of rows, the latest ones."""
 FROM_CHAIN = 1 / 3
 """Largest fraction of new rows that are positions of the chain."""
 NEAR, WIDE_SHARE = (0.05, 1.2), 0.15
@@ -46,7 +46,7 @@ PER_TERM, FEW = 2.0, 500
 """Number of rows per term of the polynomials with the most terms, and least number of rows, both
 limited by `Plan.rows`."""
 CLAIMED = 3.0
-"""Excess of the surrogate's log density above which walkers do not start at a place."""
+"""Excess of the surrogate's log density, beyond its median, above which walkers seldom start."""
 STRETCHED, STRETCH = 0.2, 3.0
 """Fraction of new rows that are moved along weak coordinates, and largest distance [std]."""
 CHUNK = LEAST_ROWS

@@ -65,8 +65,8 @@ def sampled(
     shape = (plan.ensembles, draws)
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:  # beside the chain, which leaves a core idle at times
-        variances = pool.submit(drawn_variances, problem, fitted, shape, plan.seed, stop=stop)
         try:
+            variances = pool.submit(drawn_variances, problem, fitted, shape, plan.seed, stop=stop)
             blocks = ensemble.extended(first.target(), plan, parts[0], checkpoint, report)
             if not variances.done():
                 report.stage("drawing the variances of the noise")

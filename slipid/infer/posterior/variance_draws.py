@@ -58,9 +58,9 @@ from slipid.infer.posterior.variance_likelihood import (
 )
 
 _LEAST_SWEEPS, _STATES, _WORK = 100, 600, 7e6
-"""Least number of sweeps of a chain from which draws are taken, largest number of those of all
-chains together, and number of elements of the segments' covariances in the sweeps of a chain, if
-their number is between these."""
+"""Least number of sweeps of each chain from which draws are taken; largest number of those of all
+chains together, unless there are more than six; and number of elements of the segments' covariances
+in the sweeps of a chain, if their number is between these."""
 _WARM_UP = 0.4
 """Number of sweeps before the first draw, per sweep from which draws are taken."""
 _PSEUDO = 20

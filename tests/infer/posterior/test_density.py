@@ -198,6 +198,17 @@ def test_terms_equal_the_posterior_by_definition(problem, part):
     assert (np.abs((other - other[0]) - (found - found[0]))[1:, :2] > 0.1).all()
 
 
+def test_many_elements_have_the_residuals_of_few(problem):
+    """They are evaluated in chunks, the last of which has other elements than its own."""
+    d = density(problem, EVERYTHING)
+    few = near(d)
+    many = np.concatenate([few] * (70 // len(few) + 1))[:69]
+    of_few, found = (d.mapped(Density.residual_blocks, x, None) for x in (few, many))
+    for k, r in found.items():
+        assert len(r) == len(many)
+        np.testing.assert_allclose(r, of_few[k][np.arange(69) % len(few)], rtol=1e-9, atol=1e-12)
+
+
 def test_residuals_are_less_shared_effects(problem):
     d, dense = density(problem, EVERYTHING), Dense(problem, BLOCKS[EVERYTHING])
     x = near(d)

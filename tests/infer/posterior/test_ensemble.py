@@ -211,17 +211,28 @@ def test_an_interrupted_chain_continues_like_an_uninterrupted_one():
 
 
 @pytest.mark.slow
-def test_a_slow_chain_begins_again_with_a_new_surrogate_though_it_is_interrupted():
+def test_a_slow_chain_begins_again_with_a_new_surrogate(monkeypatch):
+    """It does so three times at most, also if it is interrupted or continued beyond a limit."""
+    monkeypatch.setattr("slipid.infer.posterior.ensemble.JUDGED", (40, 60))
     target, _, _ = banana()
-    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=29, rows=200)
-    plan = replace(plan, least_draws=1e6)
+    plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=42, rows=200, r_hat=1 + 1e-9)
+
+    def turns(blocks):
+        return [b.number + 1 for b in blocks if b.learnt]
+
+    assert turns(run(target, plan)) == [1]  # it is not slow
+    monkeypatch.setattr("slipid.infer.posterior.ensemble.SLOW", 0.1)
     whole = run(target, plan)
-    assert [b.number + 1 for b in whole if b.learnt] == [1, 10]  # eight blocks after the warm-up
-    assert warm_up(whole, plan) == 11
-    assert positions(whole, plan).shape[1] == 18 * 5
+    assert turns(whole) == [1, 10, 19, 28]  # eight blocks after the warm-up
+    assert warm_up(whole, plan) == 29
+    assert positions(whole, plan).shape[1] == (42 - 29) * 5
     for stop in (5, 10, 11):
         again = run(target, plan, whole[:stop])
         np.testing.assert_array_equal(positions(again, plan), positions(whole, plan))
+    first = run(target, replace(plan, most=10))
+    assert len(first) == 12  # a block beyond the warm-up
+    again = run(target, plan, first)
+    np.testing.assert_array_equal(positions(again, plan), positions(whole, plan))
 
 
 @pytest.mark.slow

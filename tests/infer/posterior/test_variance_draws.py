@@ -1,5 +1,7 @@
 """Draws of variances against densities in closed form, and their likelihood written out densely."""
 
+import threading
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from itertools import islice
 
@@ -340,3 +342,10 @@ def test_draws_are_reproducible_and_differ_between_ensembles_and_seeds(
     np.testing.assert_array_equal(one, again)
     assert (one[0] != one[1]).any(axis=0).all()
     assert (one != other).any(axis=(0, 1)).all()
+
+
+def test_draws_stop_when_they_are_not_wanted(problem, fitted):
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(CancelledError):
+        drawn_variances(problem, fitted, (2, 10), 0, stop=stop)
