@@ -39,7 +39,7 @@ RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister in NumPy's form."""
 USUAL_BLOCKS = 24
 """Number of blocks after the warm-up that are usually sufficient."""
-SLOW, JUDGED, MOST_AGAIN = 40, (160, 640), 3
+SLOW, JUDGED, MOST_AGAIN = 25, (160, 640), 3
 """Number of steps of a walker per effective draw beyond which the surrogate is learnt anew; range
 of steps after the warm-up in which this is judged, and largest number of such turns."""
 
