@@ -115,7 +115,7 @@ class Plan:
     spread: float = 2.0
     rows: int = 4500
     r_hat: float = 1.01
-    steps_per_tau: float = 40.0
+    steps_per_tau: float = 50.0
     least_draws: float = 1000.0
     seed: int = 0
 

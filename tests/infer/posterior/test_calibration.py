@@ -140,3 +140,20 @@ def whole():
         found = posterior.sampled(fit, plan, 10, blocks, QUIET)
         assert [part for part, _ in blocks.blocks] == [MOTION] * 4
         yield fit, plan, blocks, found
+
+
+def test_an_interrupt_stops_the_draws_of_variances_too(whole, monkeypatch):
+    fit, plan, _, _ = whole
+    stopped = []
+
+    def waits(*_, stop):
+        stopped.append(stop.wait(60))
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(posterior, "drawn_variances", waits)
+    monkeypatch.setattr(posterior.ensemble, "extended", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        posterior.sampled(fit, plan, 10, None, QUIET)
+    assert stopped == [True]
