@@ -105,7 +105,7 @@ def _slow(found: diagnosis.Diagnosis, blocks: Sequence[ChainBlock], plan: Plan) 
     again = sum(b.learnt is not None for b in blocks) - len(plan.warm_up[:-1])
     if found.converged or again >= MOST_AGAIN or not JUDGED[0] <= found.steps <= JUDGED[1]:
         return False
-    return found.steps * plan.ensembles * plan.walkers > SLOW * found.ess.min()
+    return bool(found.steps * plan.ensembles * plan.walkers > SLOW * found.ess.min())
 
 
 def _diagnosed(blocks: list[ChainBlock], plan: Plan) -> diagnosis.Diagnosis | None:

@@ -22,7 +22,7 @@ from slipid.infer.posterior.surrogate import (
     Surrogate,
     gaussian_root,
     group_surrogate,
-    terms,
+    term_count,
 )
 
 TARGET_FOLLOWED = 0.96
@@ -66,7 +66,7 @@ class Learner:
     def __init__(self, target: LogDensity, plan: Plan):
         self.target, self.plan = target, plan
         self._kept: dict[bytes, list[ResidualRows]] = {}
-        most = max(terms(target.inputs(g), target.positive) for g in range(target.groups))
+        most = max(term_count(target.inputs(g), target.positive) for g in range(target.groups))
         self._rows = min(plan.rows, max(round(PER_TERM * most), FEW))
 
     @cached_property

@@ -286,7 +286,7 @@ def _inputs(
     return found._replace(mean=mean, std=np.sqrt(weight @ (plain - mean) ** 2))
 
 
-def terms(of: Int[np.ndarray, "2 input"], positive: Bool[np.ndarray, " size"]) -> int:
+def term_count(of: Int[np.ndarray, "2 input"], positive: Bool[np.ndarray, " size"]) -> int:
     """Return the number of terms of each polynomial; arguments are those of `group_surrogate`."""
     inputs, wide = of.shape[1], min(MOST_WIDE, int(positive[of[0]].sum()))
     others, products = inputs - wide, wide * (wide + 1) // 2

@@ -99,8 +99,8 @@ def drawn_variances(
     rng, log_v = np.random.default_rng([seed, 1]), fitted.log_variance
     out = np.broadcast_to(log_v, (*shape, len(log_v))).copy()
     spread = (np.arange(shape[1]) + 0.5) / shape[1]
+    most = max(_LEAST_SWEEPS, _STATES // shape[0])
     for part in linear_parts(problem, fitted)[: 1 if of_motion else None]:
-        most = max(_LEAST_SWEEPS, _STATES // shape[0])
         number = int(np.clip(_WORK / part.elements, _LEAST_SWEEPS, most))
         first = int(_WARM_UP * number)
         walked = []

@@ -23,7 +23,7 @@ from slipid.infer.posterior.surrogate import (
     _pairs,
     gaussian_root,
     group_surrogate,
-    terms,
+    term_count,
 )
 from tests.infer.posterior.test_ensemble import gaussian, plateau
 
@@ -208,7 +208,9 @@ def test_terms_are_counted_as_they_are_fitted():
     of, positive = np.array([np.arange(size), np.full(size, -1)]), np.arange(size) != 4
     for some in (slice(None), slice(4, 8)):
         found = group_surrogate(ResidualRows(x, x, np.zeros(400)), of[:, some], positive, size)
-        assert terms(of[:, some], positive) == 1 + len(of[0, some]) + len(_pairs(found.inputs)[0])
+        assert term_count(of[:, some], positive) == 1 + len(of[0, some]) + len(
+            _pairs(found.inputs)[0]
+        )
 
 
 def test_walkers_do_not_start_where_the_surrogate_claims_too_much(exact):
