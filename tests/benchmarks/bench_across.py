@@ -21,7 +21,7 @@ from tests.benchmarks.record import record
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = quick((41, 42), (41,))
-STARTS = quick(10, 1)
+STARTS = quick(40, 1)
 FLOORS = quick(("firm", "medium", "soft", "short"), ("firm", "soft"))
 SITE = """
 seed = {seed}
