@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 from slipid.infer.posterior.surrogate import Matrix, Surrogate
 from slipid.support.extras import require
 
-FORMAT = 9
+FORMAT = 10
 """Version of the block files; it must be increased if their content or the algorithm changes."""
 LEAST_ROWS = 20
 """Smallest number of exact densities from which a surrogate is learnt."""

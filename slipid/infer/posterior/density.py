@@ -196,7 +196,9 @@ class Density:
         it depends on the motion of each walker (`log_prob`).
         """
         out = np.zeros((len(x), len(self.touched) + 1))
-        prior = -0.5 * np.asarray(self._pull(self.anchor, x)) ** 2
+        at = self.structure
+        std = np.asarray(self.anchor.prior_std)[at]
+        prior = -0.5 * ((x - self.problem.space.prior_mean[at]) / std) ** 2
         np.add.at(out.T, self.group, prior.T)  # group -1 is the last term
         out[:, -1] -= 0.5 * (((x - self._link_centre) @ self._link.T) ** 2).sum(axis=1)
         for group in range(len(self.touched)):
@@ -258,7 +260,7 @@ class Density:
         remainder = jnp.sum(runs.factor * runs.runs.log_jacobian(robot))
         return WhitenedResiduals(runs.white(MULTI_FLOOR_MOTION, r).ravel(), remainder)
 
-    def _pull(self, anchor: Anchor, x: Array | np.ndarray) -> Float[Array, "*walker size"]:
+    def _pull(self, anchor: Anchor, x: Float[Array, " size"]) -> Float[Array, " size"]:
         """Return the residuals of the prior [prior std]."""
         at = self.structure
         return (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]

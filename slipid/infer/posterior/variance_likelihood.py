@@ -153,7 +153,7 @@ class LinearPart:
         return np.asarray(share), np.asarray(spread)
 
 
-@eqx.filter_jit
+@jax.jit
 def _share_and_spread(voltages: Voltages, noises: Noises, log_v: Array) -> tuple[Array, Array]:
     return voltages.share_and_spread(noises, log_v)
 
@@ -308,9 +308,9 @@ class SegmentNoise:
         return np.asarray(-0.5 * np.exp(np.clip(log_v, *_RANGE)) * out)
 
 
-@eqx.filter_jit
+@jax.jit
 def _of_voltages(
-    voltages: Voltages, noises: Noises, degrees: float, r: Array, more: Array, log_v: Array
+    voltages: Voltages, noises: Noises, degrees: float | Array, r: Array, more: Array, log_v: Array
 ) -> tuple[Array, Array]:
     """Return the log likelihood of every chain's voltages, and its derivative by log variances."""
 
@@ -327,20 +327,21 @@ def _of_voltages(
 def target(part: LinearPart, noises: dict[str, SegmentNoise], at: Residuals) -> SlopedDensity:
     """Return the density of the log variances given residuals, with the weights integrated out."""
 
-    def of_voltages(log_v: Chains) -> tuple[Array, Array]:
+    def of_voltages(log_v: Chains) -> tuple[np.ndarray, Chains]:
         if part.voltages is None or at.more is None:
-            return jnp.zeros(len(log_v)), jnp.zeros_like(log_v)
+            return np.zeros(len(log_v)), np.zeros_like(log_v)
         of = (jnp.asarray(x) for x in (at.blocks["voltage"], at.more, log_v))
-        return _of_voltages(part.voltages, part.noises, part.degrees, *of)
+        value, slope = _of_voltages(part.voltages, part.noises, part.degrees, *of)
+        return np.asarray(value), np.asarray(slope)
 
     def log_density(log_v: Chains) -> np.ndarray:
-        out = part.log_prior(log_v).sum(axis=1) + np.asarray(of_voltages(log_v)[0])
+        out = part.log_prior(log_v).sum(axis=1) + of_voltages(log_v)[0]
         for k, n in noises.items():
             out += n.log_likelihood(at.blocks[k], log_v) if k != "voltage" else 0.0
         return out
 
     def slope(log_v: Chains) -> np.ndarray:
-        out = (part.typical - log_v) / VARIANCE_SPREAD**2 + np.asarray(of_voltages(log_v)[1])
+        out = (part.typical - log_v) / VARIANCE_SPREAD**2 + of_voltages(log_v)[1]
         for k, n in noises.items():
             out += n.slope(at.blocks[k], log_v) if k != "voltage" else 0.0
         return out
