@@ -371,6 +371,7 @@ def _scaled_base(noise: Components, block: str, voltage: VoltageInformation | No
     return noise.base * root[:, None, :, None] * root[:, None, None, :]
 
 
+@jax.jit
 def inverse_root(v: Float[Array, "segment m m"]) -> Float[Array, "segment m m"]:
     """Return the inverse Cholesky factor L^-1 of V = L L^T for many small matrices at once.
 

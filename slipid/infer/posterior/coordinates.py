@@ -204,9 +204,12 @@ class Anchor(eqx.Module):
 
         def rows(tree: Part) -> Part:
             # The lag of the camera and the scatter without currents are common to all segments.
-            return jax.tree.map(lambda x: x[mine] if x.shape[:1] == (segments,) else x, tree)
+            def own(x: Array) -> Array:  # indexed by NumPy, which has nothing to compile
+                return jnp.asarray(np.asarray(x)[mine]) if x.shape[:1] == (segments,) else x
 
-        def own(of: tuple[OfFloor, ...]) -> tuple[OfFloor, ...]:
+            return jax.tree.map(own, tree)
+
+        def only(of: tuple[OfFloor, ...]) -> tuple[OfFloor, ...]:
             return tuple(replace(one, segments=jnp.arange(len(mine))) for one in of[floor:][:1])
 
         return replace(
@@ -215,10 +218,10 @@ class Anchor(eqx.Module):
             root=rows(self.root),
             scale=rows(self.scale),
             log_det=rows(self.log_det),
-            shared=own(self.shared),
-            effects=own(self.effects),
-            twist=self.twist[mine],
-            twist_slope=self.twist_slope[mine],
+            shared=only(self.shared),
+            effects=only(self.effects),
+            twist=rows(self.twist),
+            twist_slope=rows(self.twist_slope),
             electric=replace(self.electric, scatter=rows(self.electric.scatter)),
             multi_floor=None,
         )
