@@ -317,11 +317,11 @@ class Density:
         return HeldMotion(z, anchor.predict(robot, z).motor_force, more)
 
 
-def _each(of: Callable[[Anchor, Any], Result]) -> Callable[[Anchor, Any, int], Result]:
+def _each(of: Callable[[Anchor, Any], Result]) -> Callable[[Anchor, Any, int | Array], Result]:
     """Return a function that applies another one to the first `count` of many elements in turn."""
     of = jax.jit(of)  # traced once for the form of its result and for its use
 
-    def each(anchor: Anchor, many: Any, count: int) -> Result:
+    def each(anchor: Anchor, many: Any, count: int | Array) -> Result:
         def put(k: int | Array, out: Result) -> Result:
             found = of(anchor, jax.tree.map(lambda x: x[k], many))
             return jax.tree.map(lambda all_, one: all_.at[k].set(one), out, found)
