@@ -70,14 +70,15 @@ def _drawn(first: Density, fitted: Fitted, seed: int, report: Reporter) -> Draws
     x = ensemble.chain(blocks, plan)[:, ::THINNED]
     ensembles, steps, walkers, size = x.shape
     x = x.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, size)
-    log_variance = drawn_variances(problem, fitted, (1, CONDITIONED), seed, of_motion=True)
-    added = added_covariance(problem, fitted, log_variance)[np.ix_(*[first.structure] * 2)]
-    x = widened(x, added, np.random.default_rng([seed, 2]))
+    log_variance = drawn_variances(problem, fitted, (1, CONDITIONED), seed)
+    added = added_covariance(problem, fitted, log_variance)
+    rng = np.random.default_rng([seed, 2])
+    x = widened(x, added[np.ix_(*[first.structure] * 2)], rng)
     z = np.broadcast_to(fitted.z, (*x.shape[:2], len(fitted.z))).copy()
     z[..., first.structure] = x
     if problem.objective.joint or not (second := Density(problem, fitted, ELECTRIC)).size:
         return Draws(z)
     report.stage(f"sampling {ELECTRIC}")
     drawn, moved = electric_given_motion(first, second, fitted.covariance, x, seed, PROPOSALS)
-    z[..., second.structure] = drawn
+    z[..., second.structure] = widened(drawn, added[np.ix_(*[second.structure] * 2)], rng)
     return None if refused(moved) > MOST_REFUSED else Draws(z)

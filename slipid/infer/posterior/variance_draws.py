@@ -84,14 +84,12 @@ def drawn_variances(
     fitted: Fitted,
     shape: tuple[int, int],
     seed: int,
-    of_motion: bool = False,
     stop: threading.Event | None = None,
 ) -> Float[np.ndarray, "ensemble draw variance"]:
     """Return draws of the log variances, from a chain for each ensemble.
 
     Draws are spread evenly over the sweeps of a chain; if there are more draws than sweeps, some
-    sweeps count several times. With `of_motion`, the variances of currents and voltages stay as
-    fitted.
+    sweeps count several times.
 
     Raises:
         CancelledError: `stop` was set by another thread.
@@ -100,7 +98,7 @@ def drawn_variances(
     out = np.broadcast_to(log_v, (*shape, len(log_v))).copy()
     spread = (np.arange(shape[1]) + 0.5) / shape[1]
     most = max(_LEAST_SWEEPS, _STATES // shape[0])
-    for part in linear_parts(problem, fitted)[: 1 if of_motion else None]:
+    for part in linear_parts(problem, fitted):
         number = int(np.clip(_WORK / part.elements, _LEAST_SWEEPS, most))
         first = int(_WARM_UP * number)
         walked = []
@@ -140,8 +138,6 @@ def added_covariance(
         of_motion[np.asarray(fitted.multi_floor.friction)] = True
     out = np.zeros_like(fitted.covariance)
     for part, drawn in zip(linear_parts(problem, fitted), (of_motion, ~of_motion), strict=False):
-        if (some == fitted.log_variance)[:, part.numbers].all():
-            continue  # these variances are not drawn
         floors, mine = floor_runs(part), np.flatnonzero(drawn)
         before = conditional(part, floors, at, fitted.log_variance, mine).covariance
         found = [conditional(part, floors, at, log_v, mine) for log_v in some]

@@ -51,9 +51,12 @@ def test_the_chain_is_the_same_for_the_same_seed(chained):
     np.testing.assert_array_equal(again.z, chained.chain.z)
 
 
-def test_uncertain_variances_widen_the_draws_of_the_motion(chained, monkeypatch):
+@pytest.mark.parametrize("electric", [False, True])
+def test_uncertain_variances_widen_the_draws(chained, monkeypatch, electric):
     problem, fitted = required(chained.problem), Fitted.of(chained)
-    sharp = np.flatnonzero((np.sqrt(np.diag(fitted.covariance)) < 0.02) & ~problem.space.electric)
+    narrow = np.sqrt(np.diag(fitted.covariance)) < 0.02
+    sharp = np.flatnonzero(narrow & (problem.space.electric == electric))
+    assert sharp.size
     added = np.zeros_like(fitted.covariance)
     added[sharp, sharp] = 8 * np.diag(fitted.covariance)[sharp]
     monkeypatch.setattr(module, "added_covariance", lambda *_: added)
