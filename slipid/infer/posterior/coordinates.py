@@ -203,13 +203,15 @@ class Anchor(eqx.Module):
         mine = np.flatnonzero(np.asarray(self.batch.surface) == floor)
 
         def rows(tree: Part) -> Part:
-            # The lag of the camera and the scatter without currents are common to all segments.
-            def own(x: Array) -> Array:  # indexed by NumPy, which has nothing to compile
-                return jnp.asarray(np.asarray(x)[mine]) if x.shape[:1] == (segments,) else x
+            def own(x: Array) -> Array:
+                # The lag of the camera and the scatter without currents are common to all segments.
+                if x.shape[:1] != (segments,):
+                    return x
+                return jnp.asarray(np.asarray(x)[mine])  # NumPy has nothing to compile
 
             return jax.tree.map(own, tree)
 
-        def only(of: tuple[OfFloor, ...]) -> tuple[OfFloor, ...]:
+        def of_floor(of: tuple[OfFloor, ...]) -> tuple[OfFloor, ...]:
             return tuple(replace(one, segments=jnp.arange(len(mine))) for one in of[floor:][:1])
 
         return replace(
@@ -218,8 +220,8 @@ class Anchor(eqx.Module):
             root=rows(self.root),
             scale=rows(self.scale),
             log_det=rows(self.log_det),
-            shared=only(self.shared),
-            effects=only(self.effects),
+            shared=of_floor(self.shared),
+            effects=of_floor(self.effects),
             twist=rows(self.twist),
             twist_slope=rows(self.twist_slope),
             electric=replace(self.electric, scatter=rows(self.electric.scatter)),

@@ -133,37 +133,38 @@ class Density:
         of: Callable[..., Result],
         *many: Any,
         floor: int | None = None,
-        only: int | None = None,
+        first: int | None = None,
     ) -> Result:
         """Return the results of a function of (density, anchor, element) for many elements.
 
         The function is compiled once for all densities with the same coordinates. Chunks of many
-        elements are evaluated in parallel.
+        elements are evaluated in parallel unless `first` is given.
 
         Args:
             of: the function.
-            many: arrays of the elements, or None, one for each further argument of the function.
+            many: arrays of the elements, at least one, or None, for each further argument of the
+                function.
             floor: floor to whose runs the anchor is restricted.
-            only: number of first elements that are evaluated, if not all; the results of the others
+            first: number of elements that are evaluated, if not all; results of those after them
                 are zero.
         """
         form = self._form
         if of not in form._each:
             # Stored here, since the cache of JAX for compiled functions would never free it.
-            form._each[of] = jax.jit(_each(lambda anchor, one: of(form, anchor, *one)))
+            form._each[of] = jax.jit(_in_turn(lambda anchor, one: of(form, anchor, *one)))
         anchor = self.anchor if floor is None else self._on_floor[floor]
         mapped = partial(form._each[of], anchor)
         count = len(jax.tree.leaves(many)[0])
-        if only is not None or count < _PARALLEL:
-            found: Result = mapped(many, count if only is None else only)
+        if first is not None or count < _PARALLEL:
+            found: Result = mapped(many, count if first is None else first)
             return found
         size = -(-count // _CHUNKS)
         place = np.minimum(np.arange(_CHUNKS * size), count - 1).reshape(_CHUNKS, size)
         chunks = [jax.tree.map(lambda x, at=at: x[at], many) for at in place]
-        first = mapped(chunks[0], size)  # compiles
+        start = mapped(chunks[0], size)  # compiles
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             rest = list(pool.map(lambda chunk: mapped(chunk, size), chunks[1:]))
-        whole: Result = jax.tree.map(lambda *x: jnp.concatenate(x)[:count], first, *rest)
+        whole: Result = jax.tree.map(lambda *x: jnp.concatenate(x)[:count], start, *rest)
         return whole
 
     def target(self) -> LogDensity:
@@ -224,7 +225,7 @@ class Density:
         # Batches of one size only, so that one compiled function serves any number of walkers.
         for k in range(0, len(x), _BATCH):
             count, some = len(x) - k, np.minimum(np.arange(k, k + _BATCH), len(x) - 1)
-            found = self.mapped(of, x[some], None, floor=floor, only=min(count, _BATCH))
+            found = self.mapped(of, x[some], None, floor=floor, first=min(count, _BATCH))
             y.append(np.asarray(found.rows)[:count])
             c.append(np.asarray(found.remainder)[:count])
         return np.concatenate(y), np.concatenate(c)
@@ -317,19 +318,19 @@ class Density:
         return HeldMotion(z, anchor.predict(robot, z).motor_force, more)
 
 
-def _each(of: Callable[[Anchor, Any], Result]) -> Callable[[Anchor, Any, int | Array], Result]:
+def _in_turn(of: Callable[[Anchor, Any], Result]) -> Callable[[Anchor, Any, int | Array], Result]:
     """Return a function that applies another one to the first `count` of many elements in turn."""
-    of = jax.jit(of)  # traced once for the form of its result and for its use
+    of = jax.jit(of)  # traced once for the shapes of its results and for its use
 
     def each(anchor: Anchor, many: Any, count: int | Array) -> Result:
         def put(k: int | Array, out: Result) -> Result:
             found = of(anchor, jax.tree.map(lambda x: x[k], many))
-            return jax.tree.map(lambda all_, one: all_.at[k].set(one), out, found)
+            return jax.tree.map(lambda whole, one: whole.at[k].set(one), out, found)
 
         size = len(jax.tree.leaves(many)[0])
-        form = jax.eval_shape(of, anchor, jax.tree.map(lambda x: x[0], many))
-        none = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), form)
-        return jax.lax.fori_loop(0, count, put, none)
+        shapes = jax.eval_shape(of, anchor, jax.tree.map(lambda x: x[0], many))
+        zeros = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), shapes)
+        return jax.lax.fori_loop(0, count, put, zeros)
 
     return each
 
@@ -337,7 +338,7 @@ def _each(of: Callable[[Anchor, Any], Result]) -> Callable[[Anchor, Any, int | A
 _PARALLEL, _CHUNKS = 64, 8
 """Least number of elements that are evaluated in parallel, and number of chunks of them."""
 _BATCH = 20
-"""Largest number of vectors that are evaluated together."""
+"""Number of vectors in each call of a compiled function, of which the last call evaluates fewer."""
 _STEPS = 10
 """Number of Levenberg-Marquardt steps for every draw of the motion."""
 PROPOSALS = 96

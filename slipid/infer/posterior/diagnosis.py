@@ -78,7 +78,7 @@ class Posterior:
 
     Attributes:
         fit: fit around which the chains were started.
-        z: draws of the search vector, those of the motion widened by what uncertain variances add.
+        z: draws of the search vector, widened by what uncertain variances add.
         log_variance: draws of the log variances.
         log_prob: log density of the parameters that were sampled by chains: all parameters, or the
             motion parameters if currents were logged, at the positions of the chains, before the

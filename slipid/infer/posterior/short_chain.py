@@ -70,6 +70,7 @@ def _drawn(first: Density, fitted: Fitted, seed: int, report: Reporter) -> Draws
     x = ensemble.chain(blocks, plan)[:, ::THINNED]
     ensembles, steps, walkers, size = x.shape
     x = x.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, size)
+    report.stage("drawing the variances of the noise")
     log_variance = drawn_variances(problem, fitted, (1, CONDITIONED), seed)
     added = added_covariance(problem, fitted, log_variance)
     rng = np.random.default_rng([seed, 2])

@@ -106,8 +106,8 @@ class GroupSurrogate(NamedTuple):
     Attributes:
         inputs: inputs of the polynomials.
         constant, linear, square: a, b and C of every component of y, and of c as the last one. The
-            component is the second index of `square`, for which products with v take a sixth of
-            the time.
+            component is the second index of `square`, since its product with v then takes a sixth
+            of the time that it takes with the component first.
         rest: sum of squares of the residuals that no component describes, less twice the mean c.
     """
 

@@ -209,6 +209,17 @@ def test_many_elements_have_the_residuals_of_few(problem):
         np.testing.assert_allclose(r, of_few[k][np.arange(69) % len(few)], rtol=1e-9, atol=1e-12)
 
 
+def test_rows_of_a_batch_that_is_not_full_are_those_of_single_vectors(problem):
+    d = density(problem, MOTION)
+    x = np.concatenate([near(d)] * 6)[:23]
+    x += 1e-3 * np.arange(23)[:, None]  # no two are equal
+    alone = np.concatenate([d.terms(x[k : k + 1]) for k in (0, 19, 20, 22)])
+    np.testing.assert_allclose(d.terms(x)[[0, 19, 20, 22]], alone, rtol=1e-9)
+    first = d.mapped(Density.whitened, x, None, first=3).rows
+    assert np.abs(first[:3]).min(axis=1).all()
+    assert not first[3:].any()
+
+
 def test_residuals_are_less_shared_effects(problem):
     d, dense = density(problem, EVERYTHING), Dense(problem, BLOCKS[EVERYTHING])
     x = near(d)
@@ -354,6 +365,7 @@ def test_a_density_is_forgotten_after_use():
     problem = stated()
     d = density(problem, MOTION)
     d.terms(near(d))
+    d.mapped(Density.residual_blocks, np.concatenate([near(d)] * 16), None)  # in chunks
     kept = weakref.ref(problem), weakref.ref(d)
     del problem, d
     gc.collect()
