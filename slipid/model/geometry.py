@@ -7,6 +7,7 @@ import abc
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -128,10 +129,9 @@ class Geometry(Drives):
 
     def frame(self) -> "WheelFrame":
         """Return the wheels as rows of matrices, for the current radii and drive offsets."""
+        fixed = (np.asarray(x) for x in (self.place, self.drive_angle, self.roller_angle))
         return _wheel_frame(
-            np.asarray(self.place),
-            np.asarray(self.drive_angle),
-            np.asarray(self.roller_angle),
+            MountedWheels(*fixed),
             self.drive_offset,
             self.radius_deviation,
             self.wheel_radius,
@@ -225,11 +225,20 @@ class WheelFrame(Drives):
         return self.on_average((self.hold / self.drive_share[:, None]).T).T
 
 
+class MountedWheels(NamedTuple):
+    """Places and angles of the wheels as in `Geometry`, but as arrays.
+
+    Other values of an array do not compile a function anew.
+    """
+
+    place: Float[np.ndarray, "wheel 2"]
+    drive_angle: Float[np.ndarray, " wheel"]
+    roller_angle: Float[np.ndarray, " wheel"]
+
+
 @partial(jax.jit, static_argnames=("drive_of", "grips"))
 def _wheel_frame(
-    place: Float[Array, "wheel 2"],
-    drive_angle: Float[Array, " wheel"],
-    roller: Float[Array, " wheel"],
+    fixed: MountedWheels,
     drive_offset: Float[Array, "*wheel"],
     radius_deviation: Float[Array, "*drive"],
     radius: Float[Array, ""],
@@ -237,7 +246,8 @@ def _wheel_frame(
     drive_of: tuple[int, ...],
     grips: tuple[bool, ...],
 ) -> WheelFrame:
-    p, drive = place * base, drive_angle + drive_offset
+    place, angle, roller = map(jnp.asarray, fixed)
+    p, drive = place * base, angle + drive_offset
     deviation = jnp.broadcast_to(radius_deviation, (len(set(drive_of)) or len(grips),))
     larger = 1.0 + (deviation[np.array(drive_of)] if drive_of else deviation)
     free = drive - roller
