@@ -243,13 +243,12 @@ def estimates(
         at, d, old = space.slices[e.path], e.declaration, fit.parameters[e.path]
         z = every[:, at]
         mean, block = z.mean(axis=0), np.cov(z.T).reshape(e.coordinates, e.coordinates)
-        value = np.atleast_1d(d.to_si(mean))
         no_scale = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
         forced = old.verdict if no_scale or old.verdict == "at_bound" else None
         prior = space.prior_mean[at], space.prior_std[at]
-        base = replace(old, value=verdicts.plain(value))
+        base = replace(old, value=verdicts.plain(d.to_si(mean)))
         is_flat = e.path in flat
-        out[e.path] = verdicts.judged(base, d, value, mean, block, prior, forced, is_flat, z)
+        out[e.path] = verdicts.judged(base, d, mean, block, prior, forced, is_flat, z)
     return doubted(marked(out, fit.disputes), fit.held_out)
 
 

@@ -148,7 +148,7 @@ def estimates(
         drawn, block, is_flat = None, covariance[at, at], e.path in flat
         if chain is not None:
             drawn, block = _contradicting(Draws(chain.z[..., at]), mean, block)
-        found = judged(base, d, value, mean, block, prior, forced, is_flat, drawn)
+        found = judged(base, d, mean, block, prior, forced, is_flat, drawn)
         out.append(found if drawn is None else replace(found, source="short_chain"))
     return tuple(out)
 
@@ -173,7 +173,6 @@ def plain(x: Any) -> Any:
 def judged(
     base: Estimate,
     d: Declaration,
-    value: Float[np.ndarray, " number"],
     mean: Float[np.ndarray, " coordinate"],
     block: Float[np.ndarray, "coordinate coordinate"],
     prior: tuple[Float[np.ndarray, " coordinate"], Float[np.ndarray, " coordinate"]],
@@ -188,7 +187,6 @@ def judged(
     Args:
         base: path, unit, meaning and value of the parameter.
         d: declaration of the parameter, with the map from the search space to SI units.
-        value: value [unit].
         mean: value in the search space.
         block: covariance in the search space.
         prior: mean and std of the prior in the search space.
@@ -196,6 +194,7 @@ def judged(
         is_flat: True if the parameter changes along a flat direction.
         drawn: draws of a posterior in the search space.
     """
+    value = np.atleast_1d(np.asarray(base.value, float))
     prior_mean, prior_std = prior
     std_z, center = np.sqrt(np.diag(block)), np.asarray(d.to_si(prior_mean))
     draws = drawn
@@ -315,7 +314,7 @@ def derived(
             drawn = (draws @ c)[:, None]
         elif chain is not None:
             drawn, block = _contradicting(Draws(chain.z @ c[:, None]), mean, block)
-        found = judged(base, d, np.exp(mean), mean, block, prior, forced, False, drawn)
+        found = judged(base, d, mean, block, prior, forced, False, drawn)
         by_chain = chain is not None and drawn is not None
         out.append(replace(found, source="short_chain") if by_chain else found)
     return tuple(out)
