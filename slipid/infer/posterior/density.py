@@ -48,6 +48,7 @@ from slipid.infer.posterior.coordinates import (
     Fitted,
     coordinates,
 )
+from slipid.infer.posterior.surrogate import Numbers
 from slipid.model.robot import Robot
 
 Result = TypeVar("Result")
@@ -201,9 +202,7 @@ class Density:
         it depends on the motion of each walker (`log_prob`).
         """
         out = np.zeros((len(x), len(self.touched) + 1))
-        at = self.structure
-        std = np.asarray(self.anchor.prior_std)[at]
-        prior = -0.5 * ((x - self.problem.space.prior_mean[at]) / std) ** 2
+        prior = -0.5 * self._pull(np.asarray(self.anchor.prior_std), x) ** 2
         np.add.at(out.T, self.group, prior.T)  # group -1 is the last term
         out[:, -1] -= 0.5 * (((x - self._link_centre) @ self._link.T) ** 2).sum(axis=1)
         for group in range(len(self.touched)):
@@ -233,7 +232,7 @@ class Density:
     def log_prob(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
         """Return the log posterior of one vector x, for all floors of the anchor."""
         found = self.whitened(anchor, x, held)
-        squares = jnp.sum(found.rows**2) + jnp.sum(self._pull(anchor, x) ** 2)
+        squares = jnp.sum(found.rows**2) + jnp.sum(self._pull(anchor.prior_std, x) ** 2)
         return found.remainder - 0.5 * squares
 
     def whitened(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> WhitenedResiduals:
@@ -265,10 +264,10 @@ class Density:
         remainder = jnp.sum(runs.factor * runs.runs.log_jacobian(robot))
         return WhitenedResiduals(runs.white(MULTI_FLOOR_MOTION, r).ravel(), remainder)
 
-    def _pull(self, anchor: Anchor, x: Float[Array, " size"]) -> Float[Array, " size"]:
-        """Return the residuals of the prior [prior std]."""
+    def _pull(self, prior_std: Numbers, x: Numbers) -> Numbers:
+        """Return the residuals of the prior [prior std], with NumPy or with JAX."""
         at = self.structure
-        return (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]
+        return (x - self.problem.space.prior_mean[at]) / prior_std[at]
 
     def residual_blocks(
         self, anchor: Anchor, x: Array, held: HeldMotion | None

@@ -139,6 +139,8 @@ def added_covariance(
     out = np.zeros_like(fitted.covariance)
     for part, drawn in zip(linear_parts(problem, fitted), (of_motion, ~of_motion), strict=False):
         floors, mine = floor_runs(part), np.flatnonzero(drawn)
+        if not mine.size:  # no parameter is drawn from these residuals
+            continue
         before = conditional(part, floors, at, fitted.log_variance, mine).covariance
         found = [conditional(part, floors, at, log_v, mine) for log_v in some]
         between = np.cov([x.mean for x in found], rowvar=False)
