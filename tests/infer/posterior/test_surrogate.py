@@ -61,6 +61,21 @@ def test_a_surrogate_of_linear_residuals_is_exact(exact):
     np.testing.assert_allclose(off - off[0], 0.0, atol=2e-3)
 
 
+def test_a_surrogate_of_quadratic_residuals_is_exact():
+    rng, size = np.random.default_rng(0), 3
+    slope, bent = rng.standard_normal((size, 4)), rng.standard_normal((4, size, size))
+
+    def rows(x):
+        found = x @ slope + np.einsum("ra,kab,rb->rk", x, bent, x)
+        return ResidualRows(x, found[:, :3], 0.1 * found[:, 3])
+
+    of, positive = np.array([np.arange(size), np.full(size, -1)]), np.zeros(size, bool)
+    found = group_surrogate(rows(rng.standard_normal((400, size))), of, positive, size)
+    new = rows(rng.standard_normal((50, size)))
+    value = found.with_slope(jnp.asarray(new.x), 0.0).value
+    np.testing.assert_allclose(value, new.log_likelihood, rtol=1e-4, atol=1e-2)
+
+
 def test_a_root_has_the_covariance_of_groups_that_are_independent_given_what_they_share(exact):
     target, *_, (_, root) = exact
     np.testing.assert_allclose(root @ root.T, target.covariance / 0.6, rtol=1e-9, atol=1e-12)
