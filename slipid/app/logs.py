@@ -277,9 +277,9 @@ def packaged_config(name: str) -> str:
 def unpack(out: Path) -> None:
     """Write the recorded logs of the test site, and their true values, to a folder."""
     try:
-        archive = ZipFile(RECORDED)
-    except OSError as error:
-        raise DataError(f"{RECORDED}: {error.strerror}; expected the recorded logs") from error
-    with archive:
-        for name in archive.namelist():
-            write_bytes(out / name, archive.read(name))
+        with ZipFile(RECORDED) as archive:
+            content = {name: archive.read(name) for name in archive.namelist()}
+    except Exception as error:  # zipfile and zlib raise errors of many types for damaged files
+        raise DataError(f"{RECORDED}: {error}; install slipid again") from error
+    for name, data in content.items():
+        write_bytes(out / name, data)

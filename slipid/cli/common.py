@@ -147,15 +147,15 @@ def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
 
 def is_bench(path: Path) -> bool:
     """Return True if a config, or the config in a result folder, describes motors on a bench."""
-    import tomllib
+    from slipid.support.toml_file import mapping_of, text_of
 
     if path.is_dir():
         if (path / "motor.json").is_file() and not (path / "config.toml").is_file():
             return True
         path = path / "config.toml"
     try:
-        robot = tomllib.loads(path.read_text(encoding="utf-8")).get("robot")
-    except (OSError, ValueError):  # the command itself reports the error
+        robot = mapping_of(path, text_of(path)).get("robot")
+    except DataError:  # the command itself reports the error
         return False
     return isinstance(robot, dict) and robot.get("drive") == "motor"
 

@@ -26,6 +26,7 @@ from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.interface import Readings
 from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
+from slipid.support.parsing import arrays_of, json_of
 
 SCHEMA = "slipid.stablehlo/2"
 TOLERANCE = 1e-9
@@ -135,7 +136,7 @@ def load_program(folder: Path | str) -> Program:
         except OSError as error:
             raise DataError(f"{place / name}: {error.strerror}; export the robot again") from error
     try:
-        about = json.loads(content["step.json"])
+        about = json_of(content["step.json"])
         schema = about.pop("schema")
         if schema != SCHEMA:
             raise DataError(
@@ -143,7 +144,7 @@ def load_program(folder: Path | str) -> Program:
                 f"{SCHEMA}; update slipid, or export the robot again"
             )
         signature = typed(Signature, about)
-        arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
+        arrays = arrays_of(content["golden.npz"])
         start = [jnp.asarray(arrays[f"start{k}"]) for k in range(len(signature.state))]
         programs = [export.deserialize(bytearray(content[name])) for name in FILES[:2]]
         steps = Golden(arrays["given"], arrays["said"], arrays["command"])

@@ -31,6 +31,7 @@ from slipid.search_space import Choice, Space, with_values
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, json_text, read_json, write_bytes
+from slipid.support.parsing import arrays_of
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
@@ -123,8 +124,7 @@ def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
         raise DataError(
             f"{path}: damaged, its hash differs from the one in {FIT}; run `slipid identify` again"
         )
-    with np.load(io.BytesIO(packed), allow_pickle=False) as npz:
-        return {name: npz[name] for name in npz.files}
+    return arrays_of(packed)
 
 
 def identified_json(fit: Fit) -> Content:

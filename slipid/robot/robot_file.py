@@ -30,7 +30,8 @@ from slipid.robot.record import (
     Setting,
 )
 from slipid.support.errors import DataError
-from slipid.support.files import checksum, write_bytes
+from slipid.support.files import checksum, read_bytes, write_bytes
+from slipid.support.parsing import json_of
 
 _MOST = sys.float_info.max
 _PLAIN = {bool: "true or false", str: "a string", int: "a whole number", NoneType: "null"}
@@ -158,17 +159,11 @@ def read_robot(path: Path) -> RobotRecord:
 
 def _content(path: Path) -> dict[str, object]:
     """Return the JSON object in a robot's file; raise `DataError` if its schema is not known."""
+    raw = read_bytes(path, "a robot.json that `slipid identify` wrote")
     try:
-        content = json.loads(
-            path.read_bytes().decode("utf-8"), parse_constant=_refused, object_pairs_hook=_once
-        )
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise DataError(
-            f"{path}: {reason}; expected a robot.json that `slipid identify` wrote"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not valid JSON ({error}); {REWRITE_HINT}") from error
+        content = json_of(raw)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if not (isinstance(schema, str) and re.fullmatch(r"slipid\.robot/[1-9][0-9]{0,8}", schema)):
         raise DataError(
@@ -182,17 +177,6 @@ def _content(path: Path) -> dict[str, object]:
             f"{path}: written by {age} slipid as {schema}, but this slipid reads {SCHEMA}; {then}"
         )
     return dict(content)
-
-
-def _refused(word: str) -> None:
-    raise ValueError(f"{word} is not a number")
-
-
-def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        raise ValueError("a key occurs twice")
-    return content
 
 
 def _text(value: object, indent: str = "") -> str:

@@ -1,20 +1,29 @@
 """Checkpoints: finished parts of a long job in files, from which an interrupted job continues."""
 
 import hashlib
+import json
+import logging
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from slipid.support.errors import DataError
-from slipid.support.files import read_json, write_arrays, write_json
+from slipid.support.files import (
+    checksum,
+    json_text,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_json,
+)
 
-SCHEMA = "slipid.checkpoint/1"
+SCHEMA = "slipid.checkpoint/2"
+_LOG = logging.getLogger("slipid")
 LIBRARIES = (
     "slipid",
     "jax",
@@ -74,8 +83,8 @@ def key_of(*parts: object) -> str:
 class Checkpoint:
     """Finished parts of one job, keyed by name, in files of one folder.
 
-    A part is written completely or not at all. Damaged parts, and parts of other jobs, are treated
-    as absent, so that they are computed again.
+    A part is written completely or not at all. Damaged parts, which are logged, and parts of other
+    jobs are treated as absent, so that they are computed again.
 
     Attributes:
         folder: folder of the files; it is made with the first part.
@@ -94,29 +103,38 @@ class Checkpoint:
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
         """Return the arrays saved under a name, or None if this job has saved none."""
-        try:
-            # The file is opened here because numpy would leave a damaged one open.
-            path = self.folder / f"{name}.npz"
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
-                if str(kept["key"]) != self.key:
-                    return None
-                return {k: kept[k] for k in kept.files if k != "key"}
-        except (OSError, EOFError, KeyError, ValueError, BadZipFile):
+        path = self.folder / f"{name}.npz"
+        if not path.exists():
             return None
+        try:
+            kept = read_arrays(path, "a checkpoint")
+        except DataError as error:
+            _LOG.warning("%s; it is computed again", error)
+            return None
+        return kept if str(kept.pop("key", None)) == self.key else None
 
     def save_json(self, name: str, content: object) -> None:
         """Write plain values under a name to `<name>.json`."""
         path = self.folder / f"{name}.json"
-        write_json(path, {"schema": SCHEMA, "key": self.key, "content": content})
+        content = json.loads(json_text(content))
+        mark = checksum({"content": content})
+        write_json(path, {"schema": SCHEMA, "key": self.key, "sha256": mark, "content": content})
 
     def load_json(self, name: str) -> Any:
         """Return the plain values saved under a name, or None if this job has saved none."""
+        path = self.folder / f"{name}.json"
+        if not path.exists():
+            return None
         try:
-            kept = read_json(self.folder / f"{name}.json", "a checkpoint")
-            if kept["schema"] == SCHEMA and kept["key"] == self.key:
+            kept = read_json(path, "a checkpoint")
+            if kept["schema"] != SCHEMA or kept["key"] != self.key:
+                return None
+            if kept["sha256"] == checksum({"content": kept["content"]}):
                 return kept["content"]
-        except (DataError, KeyError, TypeError):
-            pass
+            error: Exception = DataError(f"{path}: its content does not match its checksum")
+        except (DataError, KeyError, TypeError) as found:
+            error = found
+        _LOG.warning("%s; it is computed again", error)
         return None
 
     def remove(self, pattern: str = "*") -> None:

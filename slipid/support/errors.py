@@ -1,15 +1,42 @@
 """The error for bad input of a user, and functions for the common form of its messages."""
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
+
+LONGEST = 500
+"""Largest number of characters of the message of a `DataError`."""
+_LONG_WORD = re.compile(r"\S{81,}")
 
 
 class DataError(ValueError):
     """Error about wrong input of a user: files, options or configs.
 
-    The message names the file, the row or column, and the remedy.
+    The message names the file, the row or column, and the remedy. It has at most `LONGEST`
+    characters, whatever values of a file it shows.
     """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(_bounded(str(message)))
+
+
+def _bounded(message: str) -> str:
+    """Return a printable message of at most `LONGEST` characters.
+
+    A longer one loses the middles of its long words, then its last lines, then its end.
+    """
+    message = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
+    if len(message) <= LONGEST:
+        return message
+    message = _LONG_WORD.sub(lambda m: f"{m[0][:40]}...{m[0][-37:]}", message)
+    lines = message.split("\n")
+    for count in range(len(lines), 0, -1):
+        more = f"\n... ({len(lines) - count} more lines)" if count < len(lines) else ""
+        kept = "\n".join(lines[:count]) + more
+        if len(kept) <= LONGEST:
+            return kept
+    return f"{message[: LONGEST - 3]}..."
 
 
 def bad_data(

@@ -1,18 +1,20 @@
 """Reading and writing of files: atomic writes, strict JSON, and arrays without pickle."""
 
 import hashlib
-import io
 import json
 import os
 import secrets
+import stat
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slipid.support.errors import DataError
+from slipid.support.parsing import arrays_of, json_of
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -75,23 +77,60 @@ def _plain(value: object) -> object:
     raise TypeError(f"{type(value).__name__} cannot be written as JSON")
 
 
+def read_bytes(path: Path, what: str, most: int = 256 * 2**20) -> bytes:
+    """Return the content of a file.
+
+    Args:
+        path: the file.
+        what: expected kind of file, for messages.
+        most: largest size of the file [bytes].
+
+    Raises:
+        DataError: the file is absent, unreadable, too large or not a regular file.
+    """
+    try:
+        kept = path.stat()
+        if not stat.S_ISREG(kept.st_mode):
+            found = "a folder" if stat.S_ISDIR(kept.st_mode) else "not a regular file"
+            raise DataError(f"{path}: {found}; expected {what}")
+        if kept.st_size > most:
+            raise DataError(f"{path}: {kept.st_size} bytes; expected {what}, at most {most} bytes")
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; expected {what}") from error
+
+
 def read_json(path: Path, what: str) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        DataError: the file is missing or not JSON; the message names `what` was expected.
+        DataError: the file is missing or not JSON (see `json_of`); the message names `what` was
+            expected.
     """
+    raw = read_bytes(path, what)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected {what}") from error
+        return json_of(raw)
     except ValueError as error:
-        raise DataError(f"{path}: not valid JSON ({error}); expected {what}") from error
+        raise DataError(f"{path}: {error}; expected {what}") from error
+
+
+def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
+    """Return the arrays of an npz file by name.
+
+    Raises:
+        DataError: the file is missing, damaged or too large (see `arrays_of`); the message names
+            `what` was expected.
+    """
+    raw = read_bytes(path, what)
+    try:
+        return arrays_of(raw)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}; expected {what}") from error
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
     """Write named arrays to an .npz file without pickle."""
-    buffer = io.BytesIO()
+    buffer = BytesIO()
     save = np.savez_compressed if compress else np.savez
     save(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())

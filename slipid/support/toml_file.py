@@ -1,6 +1,5 @@
 """Checking of TOML files against pydantic models; the error has a line for each mistake."""
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -12,6 +11,8 @@ from pydantic_core import ErrorDetails
 
 from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
+from slipid.support.files import read_bytes
+from slipid.support.parsing import Step, spelled, toml_of
 
 CLOSED = ConfigDict(extra="forbid")
 """Pydantic config of dataclasses that describe tables of a TOML file: unknown keys are errors."""
@@ -19,9 +20,8 @@ Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
 Part = Annotated[float, Field(ge=0, lt=1)]
 """Fraction of a whole, at least 0 and below 1 [1]."""
+_MOST_BYTES = 4 * 2**20
 Model = TypeVar("Model")
-Step = str | int
-"""Step of a location in a TOML file: the key of a table, or the index in a list."""
 
 
 class Section(BaseModel):
@@ -33,19 +33,17 @@ class Section(BaseModel):
 def text_of(path: Path, what: str = "a config") -> str:
     """Return the text of a file; raise `DataError`, naming the expected `what`, if unreadable."""
     try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected {what} (TOML file)") from error
+        return read_bytes(path, f"{what} (TOML file)", _MOST_BYTES).decode("utf-8")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not UTF-8 text; expected {what} (TOML file)") from error
 
 
 def mapping_of(path: Path, text: str) -> Content:
-    """Return the content of a TOML text; raise `DataError` if the text is not valid TOML."""
+    """Return the content of a TOML text; raise `DataError` as `toml_of` raises `ValueError`."""
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise DataError(f"{path}: not valid TOML: {error}") from error
+        return toml_of(text)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
@@ -70,7 +68,7 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
     """Return a line about one mistake: file, key, what was found and what was expected."""
     kind, given, context = error["type"], error["input"], error.get("ctx", {})
     steps = _steps(mapping, error["loc"], kind in ("missing", "missing_argument"))
-    where = f"{path}: {_spelled(steps)}" if steps else str(path)
+    where = f"{path}: {spelled(steps)}" if steps else str(path)
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         known = list(_annotations(_kinds_at(mapping, root, steps[:-1])[0]))
         alike = did_you_mean(steps[-1], known)
@@ -110,18 +108,6 @@ def _steps(mapping: object, loc: Sequence[Step], missing: bool) -> list[Step]:
             continue
         steps.append(part)
     return steps
-
-
-def _spelled(steps: Sequence[Step]) -> str:
-    """Return a location as a text such as `a.b[2]`, in which items of lists are counted from 1."""
-    out = ""
-    for step in steps:
-        if isinstance(step, int):
-            out += f"[{step + 1}]"
-        else:
-            plain = step.replace("_", "").replace("-", "").isalnum()
-            out += f".{step}" if plain else f'."{step}"'
-    return out.removeprefix(".")
 
 
 def _below(here: object, step: Step) -> object:

@@ -130,8 +130,8 @@ def test_other_drives(tmp_path, section, wheels, grips):
         ),
         (
             "mass_kg = 12.0",
-            "mass_kg = 12.0\nsensors = { gyro_std_rad_s = nan }\nactuators = { lag_s = -1 }",
-            ["robot.sensors.gyro_std_rad_s: nan", "robot.actuators.lag_s: -1", "or equal to 0"],
+            "mass_kg = 12.0\nsensors = { gyro_std_rad_s = -1 }\nactuators = { lag_s = -1 }",
+            ["robot.sensors.gyro_std_rad_s: -1", "robot.actuators.lag_s: -1", "or equal to 0"],
         ),
         ("[60, 180, 300]", "[60, 180]", ["robot.wheel_azimuths_deg", "at least 3"]),
         ("[[logs]]", "[[log]]", ["log: no such key", "did you mean logs", "logs: missing"]),

@@ -259,7 +259,7 @@ def test_cells_are_covered_by_their_middles():
             ('"surface": "gray"', '"surface": "sand"'),
             "no colour of sand; expected every surface in the key 'colours'",
         ),
-        (('"confidence": 2.5', '"confidence": NaN'), r"confidence: nan; expected"),
+        (('"confidence": 2.5', '"confidence": NaN'), "NaN is not a number"),
         (('"colour": "#808080"', '"colour": "gray"'), r"properties\.colour: 'gray'; expected"),
         (('"type": "Feature"', '"type" "Feature"'), "not valid JSON"),
     ],

@@ -48,12 +48,27 @@ def test_parts_that_were_never_kept_are_absent(kept, tmp_path):
 
 
 @pytest.mark.parametrize("length", [0, 1, 50, 100, -9])
-def test_damaged_files_are_absent(kept, length):
+def test_damaged_files_are_absent_and_that_is_logged(kept, length, caplog):
     for suffix in ("npz", "json"):
         path = kept.folder / f"part.{suffix}"
         path.write_bytes(path.read_bytes()[:length])
     assert kept.load("part") is None
     assert kept.load_json("part") is None
+    assert len(caplog.messages) == 2
+    assert all("it is computed again" in message for message in caplog.messages)
+
+
+def test_an_edited_number_is_noticed(kept, caplog):
+    path = kept.folder / "part.json"
+    path.write_text(path.read_text().replace("3.14", "3.24"))
+    assert kept.load_json("part") is None
+    assert "does not match its checksum" in caplog.text
+
+
+def test_absent_and_other_parts_are_not_logged(kept, caplog):
+    assert Checkpoint(kept.folder, "other").load_json("part") is None
+    assert kept.load("none") is None
+    assert not caplog.messages
 
 
 @pytest.mark.parametrize("text", ["[]", "null", '{"key": "mine"}', '{"content": 1}'])

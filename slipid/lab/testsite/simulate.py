@@ -27,7 +27,7 @@ from slipid.lab.testsite.studio import Studio, film
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.executor import InProcess, Processes, results
-from slipid.support.files import read_json, write_arrays, write_bytes, write_json
+from slipid.support.files import read_arrays, read_json, write_arrays, write_bytes, write_json
 from slipid.support.progress import Reporter
 
 
@@ -197,18 +197,21 @@ def film_and_write(what: tuple[SiteTask, SiteCamera]) -> None:
     The times of its frames are written first, so that a video marks the task as finished.
     """
     task, camera = what
-    with np.load(_truth_path(task)) as true:
-        studio = Studio(task.site, task.run.load, task.run.map, camera, task.seed)
-        path = _video_path(task)
-        frames = np.arange(true["time"][0] - camera.early_s, true["time"][-1], camera.frame_s)
-        rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
-        write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
-        with closing(studio):
-            film(studio, dict(true), frames, path)
+    true = read_arrays(_truth_path(task), _TRUTH)
+    studio = Studio(task.site, task.run.load, task.run.map, camera, task.seed)
+    path = _video_path(task)
+    frames = np.arange(true["time"][0] - camera.early_s, true["time"][-1], camera.frame_s)
+    rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
+    write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
+    with closing(studio):
+        film(studio, true, frames, path)
 
 
 def _video_path(task: SiteTask) -> Path:
     return task.out / "video" / f"{task.name}.avi"
+
+
+_TRUTH = "the truth of a run that `slipid simulate` drove"
 
 
 def _truth_path(task: SiteTask) -> Path:
@@ -217,8 +220,8 @@ def _truth_path(task: SiteTask) -> Path:
 
 def _motion(task: SiteTask) -> Motion:
     """Return the true motion of a run that was driven."""
-    with np.load(_truth_path(task)) as true:
-        return task.run, true["pose"], true["wheel_angle"]
+    true = read_arrays(_truth_path(task), _TRUTH)
+    return task.run, true["pose"], true["wheel_angle"]
 
 
 def drive_and_write(task: SiteTask) -> float:

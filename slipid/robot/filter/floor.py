@@ -19,9 +19,7 @@ only in the step in which it is measured; without evidence the map does not chan
 """
 
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
-from zipfile import BadZipFile
 
 import equinox as eqx
 import jax
@@ -30,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.support.errors import DataError
-from slipid.support.files import write_arrays
+from slipid.support.files import read_arrays, write_arrays
 
 MAP_ERROR = 0.1
 """Probability that the map shows the wrong floor under a wheel [1]."""
@@ -93,14 +91,23 @@ class Floor(eqx.Module):
         Raises:
             DataError: the file is absent or was not written by `save`.
         """
-        try:
-            with np.load(BytesIO(Path(path).read_bytes()), allow_pickle=False) as file:
-                # index -1, an unknown surface, picks the last name, "", which is no label
-                names = [*file["labels"].tolist(), ""]
-                corner, cell = tuple(file["corner"].tolist()), float(file["cell"])
-                return cls.of(names, file["cells"], corner, cell, labels)
-        except (OSError, ValueError, LookupError, TypeError, EOFError, BadZipFile) as error:
-            raise DataError(f"{path}: {error}; expected a map written by Floor.save") from error
+        expected = "a map written by Floor.save"
+        kept = read_arrays(Path(path), expected)
+        names, corner, cell, cells = (
+            kept.get(name, np.zeros(0)) for name in ("labels", "corner", "cell", "cells")
+        )
+        shapes = (names.ndim, corner.shape, cell.shape, cells.ndim) == (1, (2,), (), 2)
+        kinds = (names.dtype.kind, corner.dtype.kind, cell.dtype.kind) == ("U", "f", "f")
+        if not (shapes and kinds and cells.dtype.kind == "i" and cells.size):
+            raise DataError(f"{path}: arrays of other names, shapes or types; expected {expected}")
+        finite = np.isfinite(corner).all() and np.isfinite(cell) and cell > 0
+        if not finite or cells.min() < -1 or cells.max() >= len(names):
+            raise DataError(
+                f"{path}: corner {corner}, cell {cell}, floors {cells.min()} to {cells.max()}; "
+                f"expected finite numbers, a positive cell and floors of -1 to {len(names) - 1}"
+            )
+        # index -1, an unknown surface, picks the last name, "", which is no label
+        return cls.of([*names.tolist(), ""], cells, tuple(corner.tolist()), float(cell), labels)
 
     def under(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
