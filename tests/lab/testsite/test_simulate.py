@@ -219,7 +219,7 @@ def test_the_configs_that_ship_are_good(path):
             ("[maps]", '[robot]\ncentres_m = { "../x" = [0, 0] }\n[maps]'),
             "'../x' cannot be the name",
         ),
-        (("[maps]", "[robot]\ncentres_m = { as_built = [nan, 0] }\n[maps]"), "centre of mass"),
+        (("[maps]", "[robot]\ncentres_m = { as_built = [9.0, 0] }\n[maps]"), "centre of mass"),
         (
             ("[maps]", "[robot]\nwheel_azimuths_deg = [60, 60, 60]\n[maps]"),
             "expected angles all around",
