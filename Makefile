@@ -17,7 +17,7 @@ NEWEST = $(shell \
   done)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs test quick newest every nightly check bench format clean
+.PHONY: help demo docs test quick newest every nightly check bench mutants format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | awk -F '\t' '{printf "make %-8s %s\n", $$1, $$2}'
@@ -63,6 +63,9 @@ ifneq ($(BENCHES),)
 else
 	@echo "no benchmark yet: they are files tests/benchmarks/bench_*.py"
 endif
+
+mutants: $(VENV)/.dev-stamp ## faults planted in the package one by one, which tests must notice (hours; goes on where it was stopped)
+	$(BIN)/python tests/mutants/run.py
 
 format: $(VENV)/.dev-stamp ## rewrite the sources in the project's format
 	$(BIN)/ruff format .

@@ -10,15 +10,17 @@ A mutant of `mutants.toml` is one short text of one file of the package, and the
 place. It runs in a copy of the repository on the tests of its room, one entry of `tests` after the
 other, those that should notice it first, up to the first failure:
 
-    killed      a test failed
-    survived    all passed: a test is missing
+    killed      a test failed, or its module does not come through with what the package made of it
+    survived    all passed: a test is missing, or `survives` says why there can be none
     timeout     an entry took longer than `--timeout` [s]
     error       nothing is known: a text or a test is not there, or could not be imported
 
 `file` is a path below `slipid/`. Where its text is not there, the one file of the package that has
 it is taken, and that is said; tests whose file was moved are found by its name. Only a text that
 has itself changed is to be written anew. Results are kept in `--results`, a JSON file; mutants that
-have one are skipped, but for errors. The exit code is 0 where all that were asked for are killed.
+have one are skipped, but for errors. The last lines list what was not killed, with the explanation,
+count the mutants of every room, and give the share that was killed. The exit code is 0 where every
+survivor of those that were asked for has an explanation, and at least 90 % of them are killed.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -41,21 +44,29 @@ from queue import SimpleQueue
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = shutil.ignore_patterns(".*", "__pycache__", "demo_out", "out")
-VERDICTS = {0: "survived", 1: "killed"}
+VERDICTS = {0: "survived", 1: "killed", 2: "killed"}
 """By exit code of pytest; any other one is an error."""
-BROKEN = re.compile(r"ERROR (?!\S*::)|.*(ImportError|ModuleNotFoundError|fixture '\w+' not found)")
-"""Lines of what could not be collected, imported or set up: no failure of a test."""
+BROKEN = re.compile(
+    r"(?!FAILED|ERROR )|ERROR (?!.* - )|.*(ImportError|ModuleNotFoundError|fixture '\w+' not found)"
+)
+"""Lines of what was not found, imported or set up: no failure of a test."""
+LEAST_KILLED = 0.9
+"""Smallest share of mutants that tests have to notice."""
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A fault: the old text of a file, the new one, and the tests that should notice."""
+    """A fault: the old text of a file, the new one, and the tests that should notice.
+
+    `survives` says why no test can notice, or none should.
+    """
 
     name: str
     file: str
     old: str
     new: str
     tests: Sequence[str]
+    survives: str = ""
 
 
 @dataclass(frozen=True)
@@ -191,6 +202,23 @@ def sound(some: Sequence[Mutant], timeout: float) -> str:
     return verdict
 
 
+def summary(some: Sequence[Mutant], kept: Mapping[str, Outcome]) -> bool:
+    """Print what was not killed, and counts of every room; True if that is good enough."""
+    verdicts = {m.name: kept[m.name].verdict for m in some}
+    print("\nnot killed:" if set(verdicts.values()) - {"killed"} else "")
+    for m in some:
+        if verdicts[m.name] != "killed":
+            print(f"  {verdicts[m.name]:8} {m.name}: {m.survives or 'no explanation'}")
+    rooms = Counter((m.file.split("/")[0], verdicts[m.name]) for m in some)
+    kinds = [v for v in ("killed", "survived", "timeout", "error") if v in verdicts.values()]
+    for room in sorted({room for room, _ in rooms}):
+        print(f"{room:16}", ", ".join(f"{rooms[room, v]:3} {v}" for v in kinds if rooms[room, v]))
+    killed = [*verdicts.values()].count("killed") / max(len(some), 1)
+    print(f"{len(some)} mutants, {100 * killed:.1f} % killed")
+    left = [m for m in some if verdicts[m.name] != "killed" and not m.survives]
+    return killed >= LEAST_KILLED and not left
+
+
 def main() -> int:
     """Do what is asked for."""
     parser = argparse.ArgumentParser(usage=__doc__)
@@ -217,9 +245,7 @@ def main() -> int:
     done = {n for n, o in kept.items() if o.verdict != "error"}
     again = options.again or options.survivors
     run([m for m in some if again or m.name not in done], kept, options)
-    verdicts = [kept[m.name].verdict for m in some]
-    print(", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts)))
-    return int(set(verdicts) != {"killed"})
+    return int(not summary(some, kept))
 
 
 if __name__ == "__main__":

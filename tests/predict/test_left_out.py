@@ -20,6 +20,7 @@ from slipid.lab.selftest.logs import (
 from slipid.predict import fitted_slip_model, folds
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import FittedSlipModel
+from slipid.predict.selection import contact_errors, selection_folds
 from slipid.search_space import Choice
 
 PLAN = heading_grid(
@@ -47,6 +48,14 @@ def garbage(log, rng):
         voltage=noise(log.voltage),
         pose=noise(log.pose),
     )
+
+
+def backwards(log, rng):
+    """The log with finite nonsense in every measured channel but for wheels that turn backwards.
+
+    Its speed stays, so that a problem of such runs has arrays of the same shapes.
+    """
+    return replace(garbage(log, rng), wheel_angle=-log.wheel_angle)
 
 
 def task_of(logs):
@@ -120,6 +129,55 @@ def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
     for length in ("chord", "path"):
         assert one.pop(length) == pytest.approx(two.pop(length)), length
     assert one == two
+
+
+def numbers_of(found):
+    """Everything that the models of a fold have learnt, keyed by model and name."""
+    state, contact = found.optimum.state, found.models[0]
+    out = {"z": state.z, "log_variance": state.log_variance, "loss": state.loss}
+    out |= {
+        f"shared {floor} {k}": v
+        for floor, of in contact.shared.items()
+        for k, v in vars(of).items()
+    }
+    out |= {f"extrapolation {k}": v for k, v in contact.extrapolation.items()}
+    for m in found.models:
+        learnt = m.model.state if isinstance(m, FittedSlipModel) else {}
+        parts = {"covariance": m.covariance, **m.variance, **learnt}
+        out |= {f"{m.name} {k}": v for k, v in parts.items()}
+    return out
+
+
+def test_no_bit_of_what_is_learnt_depends_on_left_out_runs(logs, judged, learnt):
+    """Fits, variances, shared effects, ridges, and how they judge a run of the same fold."""
+    rng = np.random.default_rng(0)
+    witness, spoilt = judged[0], judged[1:]
+    other = task_of([backwards(log, rng) if k in spoilt else log for k, log in enumerate(logs)])
+    again = folds.fit_fold(other.problem(), CHOICES, other.dataset, QUESTION, judged, fit)
+    before, now = numbers_of(learnt), numbers_of(again)
+    assert before.keys() == now.keys()
+    assert len(before) > 100
+    for name, value in before.items():
+        np.testing.assert_array_equal(now[name], value, err_msg=name)
+    first, *rest = judge_as(learnt, task_of(logs), judged)
+    first_now, *rest_now = judge_as(again, other, judged)
+    assert first_now.to_json() == first.to_json()
+    assert first.name == logs[witness].name
+    for one, two in zip(rest_now, rest, strict=True):
+        assert (
+            one.models["calibrated"].endpoint_error > 10 * two.models["calibrated"].endpoint_error
+        )
+
+
+def test_a_step_without_a_fold_uses_nothing_of_it(logs, learnt):
+    """The errors by which a force balance is selected: its optimum is that of all runs."""
+    rng = np.random.default_rng(0)
+    witness, *spoilt = np.flatnonzero(selection_folds(collect(logs)) == 1)
+    other = task_of([backwards(log, rng) if k in spoilt else log for k, log in enumerate(logs)])
+    before = contact_errors(collect(logs), learnt.problem, learnt.optimum)
+    now = contact_errors(other.dataset, other.problem(), learnt.optimum)
+    assert now[witness] == before[witness] < 0.1
+    assert (now[spoilt] != before[spoilt]).all()
 
 
 def judge_as(found, task, judged):

@@ -300,9 +300,9 @@ def cross_calibrated(
 ) -> tuple[Calibration, dict[int, Calibration]]:
     """Return the calibration from all runs, and for each fold that from all runs outside it.
 
-    The latter follow from the former by one Gauss-Newton step, which is exact for numbers in which
-    the poses are linear. Arguments are those of `calibrate`; runs with fold -1 are never left out,
-    and `tell` reports the progress.
+    The latter follow from the former by one Gauss-Newton step at the variances and weights of all
+    runs, which is exact, given these, for numbers in which the poses are linear. Arguments are
+    those of `calibrate`; runs with fold -1 are never left out, and `tell` reports the progress.
     """
     fit = _fitted(data, space, choices, tell)
     (r, slope), (_, a) = fit.linear, fit.gradient
