@@ -19,6 +19,7 @@ from slipid.cli.common import (
     suggest,
 )
 from slipid.support.extras import require
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 
@@ -52,7 +53,7 @@ def benchmark(
     from slipid.report.html.page import try_page
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
-    with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
+    with Reporter(quiet=quiet) as report, locked(out, "benchmark"), executor_of(jobs) as executor:
         found = run(BenchmarkOptions(data, out, only, quick), executor, report)
         report.stage("writing the page")
         files = (*try_page(benchmark_page(found), out / PAGE, report), "benchmark.json")
@@ -85,7 +86,8 @@ def paper(
     require("matplotlib", "report", "`slipid paper`")
     from slipid.lab.paper2021.plots import run
 
-    for path in run(data, out):
-        typer.echo(str(path))
+    with locked(out, "paper"):
+        for path in run(data, out):
+            typer.echo(str(path))
     suggest([Next("compare it with other systems", ("benchmark", "--data", data))])
     return 0

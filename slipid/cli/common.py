@@ -108,6 +108,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     @functools.wraps(command)
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
+            _check_json(options.get("json"))
             code = command(*args, **options)
         except KeyboardInterrupt:
             typer.echo(
@@ -121,6 +122,26 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
         raise typer.Exit(code)
 
     return run
+
+
+def _check_json(name: object) -> None:
+    """Raise `DataError` unless the value of `--json` is `-`, None or the name of a possible file.
+
+    This is checked first, as the file is written after the work.
+    """
+    if not isinstance(name, str) or name == "-":
+        return
+    from slipid.support.files import target_of
+
+    if not name or any(c in "*?" or not c.isprintable() for c in name):
+        raise DataError(
+            f"--json {name[:80]!r}: no name of a file; expected a path without * and ?, or - for "
+            "standard output"
+        )
+    try:
+        target_of(Path(name))
+    except DataError as error:
+        raise DataError(f"--json {error}, or - for standard output") from error
 
 
 def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:

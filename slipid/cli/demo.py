@@ -11,6 +11,7 @@ from slipid.cli.common import Next, Out, Quiet, emit, executor_of, guarded, opti
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.extras import MissingExtra
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -38,7 +39,11 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """Identify a robot from small logs of the virtual test site; write all results to a folder."""
-    with Reporter(quiet=quiet) as report, executor_of(None) as executor:
+    with (
+        Reporter(quiet=quiet) as report,
+        locked(out / "result", "demo"),
+        executor_of(None) as executor,
+    ):
         done, found, truth = run(out, plant, seed, executor, report)
     from slipid.report.answers import show_validation
     from slipid.report.calibration import show_trust

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Json, Next, OutFolder, Quiet, can_draw, emit, for_robots, option
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def design(
     from slipid.support.jax_setup import setup_jax
 
     goals, places = (parameter or (), predict or ()), (floor or (), load or ())
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "design"):
         setup_jax(quiet=True)
         fit = load_fit(out)
         report.stage("simulating candidate runs", usual_s=SIMULATING_S)

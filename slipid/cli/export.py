@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from slipid.cli.common import Json, Load, Next, Quiet, emit, flag, for_robots, option
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 
@@ -78,7 +79,7 @@ def export(
         return 0
     if out is None:
         raise DataError("--out is missing; expected a folder to write to")
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "export"):
         report.stage("reading the robot")
         robot = read_robot(source, load, _names(floors))
         options = ExportOptions(_names(to), controller, path, speed, map, recovery)

@@ -15,6 +15,7 @@ from slipid.cli.common import (
     option,
 )
 from slipid.support.content import Content
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def floors(
     from slipid.support.jax_setup import setup_jax
 
     setup_jax(quiet=True)
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "floors"):
         lookup, runs = floors_under(fitted, map, data, logs, report)
         written = write_floors(out, lookup, runs)
     content = summary(lookup, runs)

@@ -19,6 +19,7 @@ from slipid.cli.common import (
     option,
 )
 from slipid.support.errors import DataError
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def identify(
         if only:
             raise DataError("--only calibration: a motor on a bench has no kinematics to calibrate")
         return bench(wanted, data, out, profile or (), json, quiet)
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "identify"):
         task = checked_task(config, data, report, anyway)
         if reason := task.calibration_only:
             report.line(f"calibration alone: {reason}")
@@ -177,7 +178,7 @@ def bench(
 
     if profile:
         raise DataError("--profile is not available for drive = 'motor'; omit it")
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "identify"):
         fit, written = identify_bench(config, data, out, report)
         if can_draw(report):
             from slipid.plots.bench import bench_plots

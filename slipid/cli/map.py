@@ -7,6 +7,7 @@ import typer
 
 from slipid.cli.common import Json, Next, Out, Quiet, can_draw, emit, guarded, option
 from slipid.support.errors import DataError
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def map_(
     one_blas_thread()  # several threads would slow down the many small matrix products
     robot = RobotShape(dictionary, robot_radius, marker_height)
     options = MapOptions(config, surfaces, robot, cell)
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "map"):
         result = map_of(image, OverheadCamera.load(camera), options, report)
         if result.proposal is not None and (out / PROPOSAL).exists():
             raise DataError(

@@ -8,6 +8,7 @@ import typer
 
 from slipid.cli.common import Json, MaybeOut, Quiet, can_draw, emit, flag, guarded, option
 from slipid.cli.identify import PRIORS
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 Column = str | None
@@ -98,7 +99,7 @@ def motor(
         ignored=frozenset(ignore or ()),
     )
     given = {c: given_columns(text, c) for c, text in columns.items() if text is not None}
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "motor"):
         report.stage("reading the log")
         task = read_motor_log(file, given, delimiter, options, between)
         fit = task.fit(report)

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from slipid.cli.common import Next, OutFolder, Quiet, for_robots, option, suggest
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 
@@ -24,7 +25,7 @@ def report(
     """
     from slipid.report.html.fit_page import renew
 
-    with Reporter(quiet=quiet) as progress:
+    with Reporter(quiet=quiet) as progress, locked(out, "report"):
         path = renew(out, data, progress)
     typer.echo(f"look at: {path}")
     suggest([Next("take it to the robot", ("export", out, "--out", out / "to_go"))])

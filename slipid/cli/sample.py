@@ -16,6 +16,7 @@ from slipid.cli.common import (
     option,
     renew,
 )
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 
@@ -54,7 +55,7 @@ def sample(
     from slipid.app.sample import sample as run
     from slipid.deploy.deploy import write_robot
 
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "sample"):
         posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
         written = [*WRITTEN, *write_robot(out, posterior)]
         if can_draw(report):

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from slipid.cli.common import ConfigFile, Json, Next, Out, Quiet, emit, for_robots, option
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 
@@ -30,7 +31,7 @@ def selftest(
     from slipid.lab.selftest.experiment import selftest as run
     from slipid.report.checks import show_selftest
 
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "selftest"):
         found = run(config, data, out, replicates, seed, report)
     files = ("selftest.json", "replicates.json")
     step = Next("drive it, and check the logs", ("check", config, "--data", data or "logs"))

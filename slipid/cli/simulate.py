@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from slipid.cli.common import ConfigFile, Jobs, Json, Next, Out, Quiet, emit, executor_of, guarded
 from slipid.support.content import Content
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def simulate(
     from slipid.support.toml_file import text_of
 
     plan = read(config, text_of(config))
-    with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
+    with Reporter(quiet=quiet) as report, locked(out, "simulate"), executor_of(jobs) as executor:
         found = run(plan, out, executor, report)
     emit(json, found, lambda page: show(page, found, out), list(following(plan, out)))
     return 0

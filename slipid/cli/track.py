@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Json, Next, Quiet, emit, guarded, option
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -101,8 +102,9 @@ def track(
             lone = tracking.LoneMarker(marker_size, marker_height, id, dictionary, yaw)
             bodies = (lone.target(frames, part),)
         unfinished = out.with_name(f".{out.name}.unfinished")
-        result = tracking.track(frames, above, bodies, unfinished, report, part)
-        written = [path.name for path in result.write(out)]
+        with locked(unfinished, "track"):
+            result = tracking.track(frames, above, bodies, unfinished, report, part)
+            written = [path.name for path in result.write(out)]
         if preview is not None:
             number = tracking.preview(preview, result, above, preview_frame)
             report.line(f"frame {number} is drawn in {preview}")

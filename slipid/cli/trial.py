@@ -18,6 +18,7 @@ from slipid.cli.common import (
     option,
     renew,
 )
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 
@@ -84,7 +85,7 @@ def trial(
         rest=rest,
         load=load,
     )
-    with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
+    with Reporter(quiet=quiet) as report, locked(out, "trial"), executor_of(jobs) as executor:
         done = run(out, options, executor, report)
         written = ["trial.json"]
         if can_draw(report):

@@ -18,6 +18,7 @@ from slipid.cli.common import (
     renew,
 )
 from slipid.support.content import Content
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 VALIDATION = "validation.json"
@@ -45,7 +46,7 @@ def validate(
     """
     from slipid.report.answers import show_validation
 
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "validate"):
         found, written = run(out, data, report, logs)
     emit(json, found, lambda page: show_validation(page, found), [renew(out)], out, written)
     return 0
@@ -96,7 +97,7 @@ def compare(
     from slipid.app.compare import compare as run
     from slipid.report.answers import show_comparison
 
-    with Reporter(quiet=quiet) as report:
+    with Reporter(quiet=quiet) as report, locked(out, "compare"):
         found = run(config, data, out, folds.replace(" ", "").split(","), report)
         written = ["comparison.json"]
         if can_draw(report):

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
+from slipid.support.folder import LOCK, name_of_temporary
 
 SUMS = "SHA256SUMS"
 """Name of the file of checksums in an exported folder."""
@@ -55,7 +56,7 @@ def check_writable(folder: Path) -> None:
         raise DataError(f"{folder}: not a folder; expected another path (--out)")
     sums = _sums(folder) if (folder / SUMS).is_file() else {}
     for name in sorted(_files(folder) - {SUMS}):
-        if _name_of_temporary(name) in {SUMS, *sums}:
+        if name_of_temporary(name) in {SUMS, *sums}:
             # an interrupted export left this temporary file: `write_folder` removes it
             continue
         if name not in sums:
@@ -116,16 +117,10 @@ def _sums(folder: Path) -> dict[str, str]:
     return named
 
 
-def _name_of_temporary(name: str) -> str | None:
-    """Return the final name of a temporary file of `write_bytes`; None for other files."""
-    match = re.fullmatch(r"((?:.*/)?)\.(.+)\.[0-9a-f]{8}", name)
-    return None if match is None else match[1] + match[2]
-
-
 def _files(folder: Path) -> set[str]:
-    """Return the paths of the files in a folder, except files in folders called `build`."""
+    """Return the paths of the files in a folder, except its lock and files in folders `build`."""
     paths = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    return {p.as_posix() for p in paths if BUILD not in p.parts}
+    return {p.as_posix() for p in paths if BUILD not in p.parts and p != Path(LOCK)}
 
 
 def _sum(data: bytes) -> str:

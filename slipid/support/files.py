@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import secrets
 import stat
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from slipid.support.errors import DataError
+from slipid.support.folder import temporary_of
 from slipid.support.parsing import arrays_of, json_of
 
 
@@ -23,21 +23,72 @@ def write_bytes(path: Path, data: bytes) -> None:
     Raises:
         DataError: the file cannot be written.
     """
-    partial = path.parent / f".{path.name}.{secrets.token_hex(4)}"
+    write_together({path: data})
+
+
+def write_together(content: Mapping[Path, bytes], outdated: Iterable[Path] = ()) -> None:
+    """Write several files, each atomically, after all of them fit on the disk.
+
+    If a file cannot be written, all old files stay as they are. Otherwise outdated files are
+    deleted, and the new files then appear in the given order. If the process is killed in between,
+    the last file is thus missing if it was among the outdated ones.
+
+    Args:
+        content: content of each file, keyed by its path, which may be a symbolic link to the file.
+        outdated: paths of files to delete, in this order; they may be absent.
+
+    Raises:
+        DataError: a file cannot be written.
+    """
+    temporary: dict[Path, Path] = {}
+    path = Path()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
+        for path, data in content.items():
+            target = target_of(path)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            temporary[target] = temporary_of(target)
+            with temporary[target].open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        for path in outdated:
+            path.unlink(missing_ok=True)
+        for path, partial in temporary.items():
+            partial.replace(path)
     except OSError as error:
         raise DataError(
             f"{path}: cannot be written ({error.strerror}); expected a writable folder"
         ) from error
     finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+        for partial in temporary.values():
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+
+
+def target_of(path: Path) -> Path:
+    """Return the file to write for a path, which may be a symbolic link; it need not exist.
+
+    Raises:
+        DataError: the path is that of a folder, a device or a pipe, or is no possible path.
+    """
+    kind = None
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            kind = "a folder"
+        elif not stat.S_ISREG(mode):
+            kind = "a device or a pipe"
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        raise DataError(f"{str(path)[:80]}: cannot be written ({error.strerror})") from error
+    # /dev/stdout leads to a file if the output is redirected; replacing this would lose the output
+    _, *above = path.absolute().parts[:3]
+    if above[:1] in (["dev"], ["proc"]) and above != ["dev", "shm"]:
+        kind = "a device or a pipe"
+    if kind is not None:
+        raise DataError(f"{path}: cannot be written ({kind}); expected the name of a file")
+    return Path(os.path.realpath(path))
 
 
 def writable(folder: Path) -> None:
@@ -45,8 +96,9 @@ def writable(folder: Path) -> None:
 
     Call it before long work whose results will be written to the folder.
     """
-    write_bytes(folder / ".writable", b"")
-    (folder / ".writable").unlink()
+    path = temporary_of(folder / "writable")
+    write_bytes(path, b"")
+    path.unlink()
 
 
 def write_json(path: Path, value: object) -> None:

@@ -8,10 +8,10 @@ most likely values. The friction that moves runs over several floors is sampled 
 (`slipid.infer.posterior.multi_floor_anchor`).
 """
 
-import tempfile
 import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,7 +48,9 @@ from slipid.infer.posterior.variance_draws import added_covariance, drawn_varian
 from slipid.infer.result import Fit, required
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
+from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
+from slipid.support.folder import temporary_of
 from slipid.support.progress import COMPILING_S, Reporter
 
 
@@ -255,10 +257,30 @@ def _data(
 
 def write(made: DataTree, path: Path) -> None:
     """Write the tree to a NetCDF file, completely or not at all."""
-    with tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / path.name
+    write_bytes(path, packed(made, path))
+
+
+def packed(made: DataTree, path: Path) -> bytes:
+    """Return the content of the NetCDF file of a tree.
+
+    A temporary file beside `path` is used, since the system's folder for such files may be full.
+
+    Raises:
+        DataError: the temporary file cannot be written.
+    """
+    whole = temporary_of(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         made.to_netcdf(whole, engine="h5netcdf")
-        write_bytes(path, whole.read_bytes())
+        return whole.read_bytes()
+    except OSError as error:
+        raise DataError(
+            f"{path}: cannot be written ({error.strerror or error}); expected a writable folder "
+            "with enough space"
+        ) from error
+    finally:
+        with suppress(OSError):
+            whole.unlink(missing_ok=True)
 
 
 def _replicates(

@@ -1,0 +1,111 @@
+"""Folders that commands write to: a lock for one writer at a time, and leftovers of killed ones."""
+
+import os
+import re
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from slipid.support.errors import DataError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = ".slipid.lock"
+"""Name of the file that the writer of a folder locks; it names the writer."""
+MOST_NAME_BYTES = 200
+"""Largest number of bytes of a file's name that its temporary name repeats."""
+
+
+def temporary_of(path: Path) -> Path:
+    """Return a new temporary path beside a file, from which the file is renamed."""
+    name = path.name.encode()[:MOST_NAME_BYTES].decode(errors="ignore")
+    return path.parent / f".{name}.{secrets.token_hex(4)}"
+
+
+def name_of_temporary(name: str) -> str | None:
+    """Return the final name of a temporary file; None for other files.
+
+    `name` may contain folders.
+    """
+    match = re.fullmatch(r"((?:.*/)?)\.(.+)\.[0-9a-f]{8}", name)
+    return None if match is None else match[1] + match[2]
+
+
+@contextmanager
+def locked(folder: Path | None, command: str) -> Iterator[None]:
+    """Return a context in which no other command of slipid writes to a folder.
+
+    The folder is made if necessary. Temporary files that killed commands left in it are deleted.
+    The system releases the lock when the process ends, however it ends. File systems without locks
+    are used without one.
+
+    Args:
+        folder: the folder; None for a command that writes to none.
+        command: name of the command, for the message to others.
+
+    Raises:
+        DataError: a different process has the lock, which the message names, or the folder cannot
+            be written.
+    """
+    if folder is None:
+        yield
+        return
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    lock = _locked_file(folder, f"`slipid {command}` (process {os.getpid()})")
+    try:
+        _remove_leftovers(folder)
+        yield
+    finally:
+        # Deleted while it is locked: who opened it before will notice, see `_locked_file`.
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        os.close(lock)
+        with suppress(OSError):  # it has results
+            for path in new:
+                path.rmdir()
+
+
+def _locked_file(folder: Path, owner: str) -> int:
+    """Return the descriptor of the locked file in a folder; the file then names its owner."""
+    path = folder / LOCK
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise DataError(
+                f"{folder}: cannot be written ({error.strerror}); expected a writable folder"
+            ) from error
+        try:
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            other = os.pread(lock, 100, 0).decode(errors="replace") or "a different command"
+            os.close(lock)
+            raise DataError(
+                f"{folder}: {other} is writing to this folder; wait until it has ended, or choose "
+                "a different folder"
+            ) from None
+        except OSError:  # a network file system without locks
+            pass
+        # The previous owner may have deleted the file after it was opened here.
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(lock), path.stat()):
+                with suppress(OSError):  # a full disk: the lock then names nobody
+                    os.ftruncate(lock, 0)
+                    os.pwrite(lock, owner.encode(), 0)
+                return lock
+        os.close(lock)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Delete the temporary files in a folder and in its subfolders, but not in hidden ones."""
+    for root, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in filter(name_of_temporary, files):
+            with suppress(OSError):
+                (Path(root) / name).unlink()

@@ -1,0 +1,79 @@
+"""One command at a time writes to a folder, and what a killed one left there is deleted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from slipid.support.errors import DataError
+from slipid.support.folder import LOCK, locked, name_of_temporary, temporary_of
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no flock")
+
+
+def holder(folder: Path) -> subprocess.Popen:
+    """A process that has the lock of a folder until it is ended."""
+    code = (
+        "import sys, time; from pathlib import Path; from slipid.support.folder import locked\n"
+        "with locked(Path(sys.argv[1]), 'sample'):\n"
+        "    print('locked', flush=True)\n"
+        "    time.sleep(600)\n"
+    )
+    run = subprocess.Popen([sys.executable, "-c", code, folder], stdout=subprocess.PIPE, text=True)
+    assert run.stdout.readline() == "locked\n"
+    return run
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_lock_names_its_owner_and_ends_with_it(tmp_path, how):
+    out = tmp_path / "out"
+    out.mkdir()
+    run = holder(out)
+    with (
+        pytest.raises(DataError, match=rf"out: `slipid sample` \(process {run.pid}\) is writing"),
+        locked(out, "identify"),
+    ):
+        pass
+    run.send_signal(how)
+    run.communicate(timeout=60)
+    with locked(out, "identify"):
+        assert (out / LOCK).read_text() == f"`slipid identify` (process {os.getpid()})"
+    assert not list(out.iterdir())
+
+
+def test_a_folder_that_was_made_for_nothing_is_removed_with_those_above(tmp_path):
+    with pytest.raises(DataError, match="bad logs"), locked(tmp_path / "a" / "b", "identify"):
+        raise DataError("bad logs")
+    assert not list(tmp_path.iterdir())
+    with locked(tmp_path / "a" / "b", "identify"):
+        (tmp_path / "a" / "b" / "result").touch()
+    assert [p.name for p in (tmp_path / "a" / "b").iterdir()] == ["result"]
+
+
+def test_leftovers_of_killed_commands_are_deleted_and_nothing_else(tmp_path):
+    kept = [".hidden", "a.json", ".a.json.0123456", "a.json.01234567", ".git/.x.json.01234567"]
+    left = [temporary_of(tmp_path / name) for name in ("a.json", "sub/b.npz", "n" * 255)]
+    for path in (*left, *(tmp_path / name for name in kept)):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    assert name_of_temporary(f"sub/{left[1].name}") == "sub/b.npz"
+    with locked(tmp_path, "identify"):
+        pass
+    assert not any(path.exists() for path in left)
+    assert all((tmp_path / name).exists() for name in kept)
+
+
+def test_where_locks_are_not_supported_work_goes_on(tmp_path, monkeypatch):
+    import fcntl
+
+    def unsupported(*_: object) -> None:
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", unsupported)
+    with locked(tmp_path, "identify"), locked(tmp_path, "sample"):
+        pass
