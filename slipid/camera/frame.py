@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,8 @@ UNEVEN_RATE = 0.2
 frame rate still counts as even [1]."""
 READ_AHEAD = 8
 """Number of frames that are decoded in advance."""
+Times = Float[np.ndarray, " frame"]
+"""Times of frames [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,9 @@ class FrameSource(ABC):
         count: expected number of frames; None if it is not known.
         exact: True if `count` must be met exactly, because a time is given for each frame.
         identity: text that changes when the frames change, such as name, size and date of a file.
+        notes: sentences for the user about the source, such as an orientation flag; they are
+            complete once all frames have been read.
+        faults: sentences about damage that ended the frames too early; complete as `notes`.
     """
 
     name: str
@@ -56,6 +61,8 @@ class FrameSource(ABC):
     count: int | None
     exact: bool
     identity: str
+    notes: list[str] = field(default_factory=list, kw_only=True)
+    faults: list[str] = field(default_factory=list, kw_only=True)
 
     @abstractmethod
     def frames(self, first: int = 0) -> Iterator[Frame]:
@@ -65,9 +72,10 @@ class FrameSource(ABC):
 def cut_off(source: FrameSource, count: int) -> str | None:
     """Return a sentence for the user if a source gave a wrong number of frames, else None.
 
-    Up to `LOST_SHARE` of an estimated number of frames may be missing.
+    Up to `LOST_SHARE` of an estimated number of frames may be missing. The result is also None if
+    the source has reported its damage itself.
     """
-    if source.count is None or count == source.count:
+    if source.count is None or count == source.count or source.faults:
         return None
     if source.exact:
         return (
@@ -95,7 +103,7 @@ def grey_of(picture: np.ndarray) -> Grey:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
 
 
-def read_times(path: Path) -> Float[np.ndarray, " frame"]:
+def read_times(path: Path) -> Times:
     """Return the times [s] of frames 0, 1, 2, ... from a CSV file with columns frame and time.
 
     Raises:
@@ -123,7 +131,7 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
     return np.array(times)
 
 
-def even_times(count: int, fps: float) -> Float[np.ndarray, " frame"]:
+def even_times(count: int, fps: float) -> Times:
     """Return the times [s] of frames at a constant rate `fps` [1/s], beginning at 0.
 
     Raises:
@@ -134,7 +142,7 @@ def even_times(count: int, fps: float) -> Float[np.ndarray, " frame"]:
     return np.arange(count) / fps
 
 
-def uneven(times: Sequence[float] | Float[np.ndarray, " frame"]) -> str | None:
+def uneven(times: Sequence[float] | Times) -> str | None:
     """Return a sentence for the user if frame times [s] are not evenly spaced; None otherwise."""
     steps = np.diff(np.asarray(times, float))
     if len(steps) < 2:

@@ -19,6 +19,8 @@ user gives directly for camera calibration may have any suffix."""
 NEARLY_MOST = 0.8
 """Fraction of the best dictionary's marker count [1]: of all dictionaries that detect at least this
 fraction, the smallest one is chosen."""
+MOST_PIXELS = 200_000_000
+"""Largest number of pixels of an image or a frame; it limits the memory that a file can claim."""
 Mask = Bool[np.ndarray, "row column"]
 """Boolean mask over the pixels of an image or the cells of a grid."""
 Labels = Int[np.ndarray, "row column"]
@@ -137,6 +139,14 @@ def read_picture(path: Path) -> np.ndarray:
     if picture is None:
         raise DataError(f"{path}: not an image that OpenCV reads; expected a PNG or JPEG file")
     return np.asarray(picture)
+
+
+def check_pixels(path: Path, width: int, height: int) -> None:
+    """Raise `DataError` if the images in a file have too many pixels, or none."""
+    if not 0 < width * height <= MOST_PIXELS:
+        raise DataError(
+            f"{path}: {width} x {height} pixels; expected {MOST_PIXELS // 10**6} million at most"
+        )
 
 
 def size_of(picture: np.ndarray) -> tuple[int, int]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 
@@ -37,4 +38,27 @@ def write_video(path: Path, pictures: Sequence[np.ndarray], fps: float = FPS) ->
     for picture in pictures:
         video.write(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
     video.release()
+    return path
+
+
+def encoded(
+    path: Path,
+    pictures: Sequence[np.ndarray],
+    *,
+    codec: str = "libx264",
+    pixels: str = "yuv420p",
+    rotation: int = 0,
+    options: dict[str, str] | None = None,
+) -> Path:
+    """Write frames at FPS with a codec of FFmpeg and its options, and an orientation flag [deg]."""
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream(codec, rate=round(FPS), options=options or {})
+        stream.height, stream.width = pictures[0].shape
+        stream.pix_fmt = pixels
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for picture in pictures:
+            rgb = np.repeat(picture[..., None], 3, axis=2)
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, "rgb24")))
+        file.mux(stream.encode())
     return path

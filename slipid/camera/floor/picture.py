@@ -29,9 +29,9 @@ from slipid.camera.floor.surfaces import (
     surroundings,
     without_small_patches,
 )
-from slipid.camera.frame_source import still
 from slipid.camera.opencv import Labels
 from slipid.camera.overhead import OverheadCamera
+from slipid.camera.video import still
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -65,7 +65,8 @@ def map_of(path: Path, camera: OverheadCamera, options: MapOptions, report: Repo
     """
     report.stage("projecting the image onto the floor")
     palette = Palette(schema=SCHEMA) if options.config is None else read_palette(options.config)
-    source = FloorPicture(path, still(path), camera, options.config or path, palette)
+    taken = still(path)
+    source = FloorPicture(path, taken.picture, camera, options.config or path, palette)
     if palette.names and options.surfaces is not None:
         raise DataError(
             f"{options.config}: the config already has {len(palette.names)} surfaces; omit "
@@ -88,6 +89,8 @@ def map_of(path: Path, camera: OverheadCamera, options: MapOptions, report: Repo
         check_all_present(source, names, labels)
     report.stage("drawing outlines")
     result = map_from(region, names, surfaces, costs, labels)
+    result.vector.region.notes.extend(taken.notes)
+    result = replace(result, warnings=(*taken.faults, *result.warnings))
     if points is None:
         return result
     return replace(result, proposal=_config_of(source, result, points))

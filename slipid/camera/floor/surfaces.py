@@ -54,7 +54,7 @@ MARK_RADIUS = 4
 """Distance around a marked point within which cells are assumed to have its surface [cells]."""
 
 
-MarkedCells = Int[np.ndarray, "cell 3"]
+MarkedCells = Int[np.ndarray, "_ 3"]
 """Row, column and number of the surface of some cells."""
 
 

@@ -127,8 +127,8 @@ def track(
     tracker = MarkerTracker(MarkerDetector(dictionary), ids, region)
     detections = detect_all(source, tracker, kept, report)
     tracks = tuple(track_of(camera, target, detections) for target in targets)
-    notes = [note for note in (uneven(detections.time),) if note]
-    doubts = [doubt for doubt in (cut_off(source, len(detections.frame)),) if doubt]
+    notes = [*source.notes, *filter(None, [uneven(detections.time)])]
+    doubts = [*source.faults, *filter(None, [cut_off(source, len(detections.frame))])]
     return TrackingResult(
         source,
         tracks,

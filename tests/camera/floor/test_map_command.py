@@ -164,7 +164,7 @@ def test_a_poor_map_is_written_and_ends_with_1(tmp_path):
 
 def test_the_command_needs_a_camera_of_these_pictures(tmp_path):
     image, camera = tmp_path / "floor.png", tmp_path / "camera.json"
-    cv2.imwrite(str(image), np.full((120, 160, 3), (60, 120, 60), np.uint8))
+    cv2.imwrite(str(image), np.arange(3 * 160 * 120).reshape(120, 160, 3) % 251)
     code, text = invoked("map", image, "--out", tmp_path / "out")
     assert (code, "--camera" in text) == (2, True)
     OverheadCamera.straight_down((320, 240), 0.01, 2.0).save(camera)

@@ -19,9 +19,10 @@ from slipid.camera.frame import (
     read_times,
     uneven,
 )
-from slipid.camera.frame_source import Capture, Device, open_source
+from slipid.camera.frame_source import Device, open_source
+from slipid.camera.video import VideoStream
 from slipid.support.errors import DataError
-from tests.helpers.made_sources import InMemory, write_video
+from tests.helpers.made_sources import InMemory, encoded, write_video
 
 COUNT = 12
 
@@ -111,8 +112,10 @@ def test_uneven_times_are_kept_and_reported(tmp_path, kind):
 
 
 def test_a_video_without_times_is_refused(tmp_path, monkeypatch):
-    path = write_video(tmp_path / "a.avi", pictures())
-    monkeypatch.setattr(Capture, "value", lambda self, property_id: 0.0)
+    path = encoded(tmp_path / "a.h264", pictures())
+    with pytest.raises(DataError, match=r"a\.h264: frame 0 has no time; .*--fps"):
+        numbers(open_source(str(path)))
+    monkeypatch.setattr(VideoStream, "time_of", lambda self, frame: 0.0)
     with pytest.raises(DataError, match=r"frame 1 has time 0\.0000 s after 0\.0000 s.*--fps"):
         numbers(open_source(str(path)))
     assert numbers(open_source(str(path), fps=30.0)) == list(range(COUNT))
@@ -124,7 +127,8 @@ def test_a_video_that_was_cut_off_gives_its_first_frames(tmp_path):
     video = open_source(str(tmp_path / "cut.avi"))
     frames = list(video.frames())
     assert 10 < len(frames) < 50
-    assert f"the frames end after {len(frames)} of 60" in cut_off(video, len(frames))
+    assert f"only the first {len(frames)} frames are used" in video.faults[0]
+    assert cut_off(video, len(frames)) is None
 
 
 def test_formats_that_estimate_their_length_are_not_cut_off():
@@ -198,7 +202,7 @@ def test_a_device_needs_an_end_and_has_its_own_times():
         open_source("/dev/video7", fps=30.0, seconds=1.0)
     with pytest.raises(DataError, match="--seconds is for devices"):
         open_source("a.avi", seconds=1.0)
-    with pytest.raises(DataError, match=r"video97: OpenCV cannot open this source; .* plugged in"):
+    with pytest.raises(DataError, match=r"video97: OpenCV cannot open it; .* plugged in"):
         open_source("/dev/video97", seconds=1.0)
 
 

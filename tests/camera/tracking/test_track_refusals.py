@@ -110,7 +110,7 @@ def test_sources_that_cannot_be_read(made, tmp_path):
     cv2.imwrite(str(tmp_path / "folder" / "a.png"), STAGE.frame(0.0, [ROBOT]))
     assert "--fps or --times" in refusal(made, tmp_path / "folder", *LONE)
     assert "expected --seconds with the recording's duration" in refusal(made, 99, *LONE)
-    assert "cannot open this source" in refusal(made, 99, *LONE, "--seconds", 1)
+    assert "OpenCV cannot open it" in refusal(made, 99, *LONE, "--seconds", 1)
     (tmp_path / "t.csv").write_text("frame,time\n0,0\n1,0\n", encoding="utf-8")
     video = made.video("robot", ROBOT)
     assert "times that increase" in refusal(made, video, *LONE, "--times", tmp_path / "t.csv")
