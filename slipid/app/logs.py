@@ -18,7 +18,7 @@ from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_
 from slipid.data.runs import Runs, collect, counted_once
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
-from slipid.support.errors import DataError, did_you_mean
+from slipid.support.errors import DataError, bad_data, did_you_mean, refused_as
 from slipid.support.files import read_json, write_bytes, write_json
 from slipid.support.progress import Reporter
 
@@ -257,6 +257,8 @@ def write_run_file(
 
 RECORDED = Path(__file__).with_name("recorded.zip")
 """Archive of the recorded logs of the test site that ships with slipid."""
+MOST_RECORDED = 64 * 2**20
+"""Largest size of these logs [byte]."""
 
 
 def packaged_path(name: str) -> Path:
@@ -276,10 +278,14 @@ def packaged_config(name: str) -> str:
 
 def unpack(out: Path) -> None:
     """Write the recorded logs of the test site, and their true values, to a folder."""
-    try:
-        with ZipFile(RECORDED) as archive:
-            content = {name: archive.read(name) for name in archive.namelist()}
-    except Exception as error:  # zipfile and zlib raise errors of many types for damaged files
-        raise DataError(f"{RECORDED}: {error}; install slipid again") from error
+    expected = "the recorded logs; install slipid again"
+    with refused_as(RECORDED, expected), ZipFile(RECORDED) as archive:
+        members = archive.infolist()
+        if (size := sum(one.file_size for one in members)) > MOST_RECORDED:
+            raise bad_data(RECORDED, f"{size} bytes unpacked", f"at most {MOST_RECORDED}")
+        content = {one.filename: archive.read(one) for one in members}
+    for name in content:
+        if ".." in Path(name).parts or not (out / name).is_relative_to(out):
+            raise bad_data(RECORDED, f"the path '{name}'", expected)
     for name, data in content.items():
         write_bytes(out / name, data)

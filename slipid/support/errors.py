@@ -1,7 +1,8 @@
 """The error for bad input of a user, and functions for the common form of its messages."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -65,6 +66,26 @@ def bad_data(
     if column is not None:
         where += f", column '{column}'"
     return DataError(f"{where}: {found}; expected {expected}")
+
+
+@contextmanager
+def refused_as(path: Path | str, expected: str) -> Iterator[None]:
+    """Return a context manager in which every error of a library becomes a `DataError`.
+
+    It is for nothing but calls of libraries that read a file from outside: an error of slipid
+    itself inside it would pass for a damaged file.
+
+    Args:
+        path: the file, for the message.
+        expected: expected kind of file.
+    """
+    try:
+        yield
+    except DataError:
+        raise
+    except Exception as error:  # libraries raise errors of dozens of types for damaged bytes
+        text = " ".join(str(error).split())[:200] or type(error).__name__
+        raise bad_data(path, f"cannot be read ({text})", expected) from error
 
 
 def did_you_mean(name: object, choices: Iterable[str]) -> str:

@@ -10,7 +10,6 @@ Empty cells are coordinates that were not measured. Source: end poses of squares
 directions, Borenstein and Feng 1996, IEEE Transactions on Robotics and Automation 12(6).
 """
 
-import csv
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import isfinite, nan
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.data.log import Log
+from slipid.data.reading.table import named_rows
 from slipid.support.errors import bad_data, did_you_mean
 
 _END = ("x_m", "y_m", "heading_deg")
@@ -79,14 +79,7 @@ def read_end_poses(path: Path) -> dict[str, EndPoses]:
     Raises:
         DataError: there is no such table, or a row of it is wrong.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        expected = f"a CSV table with the columns run, {', '.join(_END)}"
-        raise bad_data(path, "not readable as text", expected) from error
-    rows = csv.DictReader(lines, skipinitialspace=True)
-    names = [name.strip() for name in rows.fieldnames or ()]
-    rows.fieldnames = names
+    names, rows = named_rows(path, f"a CSV table with the columns run, {', '.join(_END)}")
     known = ("run", *_END, *_START)
     for name in names:
         if name not in known:
@@ -95,16 +88,13 @@ def read_end_poses(path: Path) -> dict[str, EndPoses]:
     if "run" not in names or not {*_END} & {*names}:
         raise bad_data(path, "columns are missing", f"run and some of {', '.join(_END)}", row=1)
     out: dict[str, EndPoses] = {}
-    for cells in rows:
-        row = rows.line_num
-        name = (cells["run"] or "").strip()
+    for row, cells in rows:
+        name = cells.get("run", "").strip()
         if not name or name in out:
             found = f"'{name}' again" if name else "no name of a run"
             raise bad_data(path, found, "every run once", row=row, column="run")
-        if None in cells:
-            raise bad_data(path, "too many cells", f"{len(names)}", row=row)
-        start = [_number(path, row, cells, column, 0.0) for column in _START]
-        end = [_number(path, row, cells, column, nan) for column in _END]
+        start = [_number(path, row, cells, c) if c in names else 0.0 for c in _START]
+        end = [_number(path, row, cells, column) for column in _END]
         if not any(isfinite(a + b) for a, b in zip(start, end, strict=True)):
             expected = "a number in x_m, y_m or heading_deg, known at the start, too"
             raise bad_data(path, "no coordinate is known at both ends", expected, row=row)
@@ -113,13 +103,9 @@ def read_end_poses(path: Path) -> dict[str, EndPoses]:
     return out
 
 
-def _number(
-    path: Path, row: int, cells: dict[str, str | None], column: str, absent: float
-) -> float:
-    """Return the number in a cell; nan if the cell is empty, `absent` if there is no column."""
-    if column not in cells:
-        return absent
-    text = (cells[column] or "").strip()
+def _number(path: Path, row: int, cells: dict[str, str], column: str) -> float:
+    """Return the number in a cell; nan if the cell is absent or empty."""
+    text = cells.get(column, "").strip()
     try:
         value = float(text) if text else nan
     except ValueError:

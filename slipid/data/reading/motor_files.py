@@ -29,7 +29,7 @@ from slipid.data.reading.table import (
 )
 from slipid.data.reading.table_format import TableFormat, format_of, lines_of, numbers_of
 from slipid.data.reading.wpilog import LogEntry, read_wpilog
-from slipid.support.errors import bad_data
+from slipid.support.errors import bad_data, refused_as
 
 STAMP = "timestamp"
 """Name of the column that is made of the times of a data log's records."""
@@ -126,8 +126,9 @@ def _rows(format: TableFormat, texts: frozenset[str], layout: Layout) -> Table:
         body = lines_of(format.path)[format.first_data_row - 1 :]
         tests = [[*cells_of(line, format.delimiter), *[""] * at][at] for line in body]
     else:
-        column = parquet_of(format.path, bytes_of(format.path)).column(named[0])
-        tests = [str(cell) for cell in column.to_pylist()]
+        table_of_texts = parquet_of(format.path, bytes_of(format.path))
+        with refused_as(format.path, f"names of tests in the column '{named[0]}'"):
+            tests = [str(cell) for cell in table_of_texts.column(named[0]).to_pylist()]
     return replace(table, tests=np.array(tests))
 
 

@@ -1,5 +1,6 @@
 """Reading of the numbers of a CSV or Parquet file; an error names the wrong cell."""
 
+import csv
 import hashlib
 import re
 from collections import Counter
@@ -16,8 +17,9 @@ from jaxtyping import Bool, Float, Int, Shaped
 from slipid.data.reading.containers import refuse_other
 from slipid.data.reading.layout import Channel, Layout
 from slipid.data.reading.units import same_unit
-from slipid.support.errors import bad_data, first_names
+from slipid.support.errors import bad_data, first_names, refused_as
 from slipid.support.extras import missing
+from slipid.support.files import read_bytes
 
 if TYPE_CHECKING:
     from pyarrow import Table as ParquetTable
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 _DATE = re.compile(r"\d{4}[-/]\d{2}[-/]\d{2}[T ]\d{2}:")
 MISSING = {"", "nan", "na", "n/a", "null", "none"}
 """Contents of cells, in lower case, that mean a missing number."""
+MOST_CELLS = 2**26
+"""Largest number of cells of a Parquet file, which may be compressed a million times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +124,9 @@ def raw_bytes(path: Path, limit: int = -1) -> bytes:
     Raises:
         DataError: the file cannot be read, or is empty.
     """
-    if path.is_dir():
-        raise bad_data(path, "a folder", "a CSV or Parquet file")
+    if path.exists() and not path.is_file():
+        found = "a folder" if path.is_dir() else "not a regular file"
+        raise bad_data(path, found, "a CSV or Parquet file")
     try:
         with path.open("rb") as file:
             raw = file.read(limit)
@@ -144,10 +149,13 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
         import pyarrow.parquet as parquet
     except ImportError as error:
         raise missing("parquet", f"{path}: a Parquet file", error) from error
-    try:
-        table = parquet.read_table(pyarrow.BufferReader(raw))
-    except pyarrow.ArrowException as error:
-        raise bad_data(path, f"not Parquet ({error})", "a complete Parquet file") from error
+    with refused_as(path, "a complete Parquet file"):
+        file = parquet.ParquetFile(pyarrow.BufferReader(raw))
+        cells = file.metadata.num_rows * file.metadata.num_columns
+        if not 0 <= cells <= MOST_CELLS:
+            raise bad_data(path, f"{cells} cells", f"at most {MOST_CELLS}; split the file")
+        table = file.read()
+        table.validate(full=True)
     if not table.num_rows:
         raise bad_data(path, "no rows", "rows of numbers")
     return table
@@ -175,7 +183,8 @@ def parquet_numbers(
             values[:, k] = column.cast(pyarrow.float64()).to_numpy()
         except pyarrow.ArrowException:
             texts.add(k)
-    return table.column_names, values, frozenset(texts)
+    with refused_as(path, "names of columns in UTF-8"):
+        return table.column_names, values, frozenset(texts)
 
 
 def text_lines(path: Path, raw: bytes) -> list[str]:
@@ -199,6 +208,26 @@ def text_lines(path: Path, raw: bytes) -> list[str]:
             path, found, "UTF-8 text (is the file binary or Latin-1?)", row=row
         ) from error
     return text.replace("\r\n", "\n").replace("\r", "\n").rstrip().split("\n")
+
+
+def named_rows(path: Path, expected: str) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Return the names of the columns of a CSV table, and the line number and cells of each row.
+
+    Cells are keyed by the names. Cells that a row lacks are absent.
+
+    Raises:
+        DataError: the file cannot be read, is not CSV text in UTF-8, or a row has too many cells.
+    """
+    lines = text_lines(path, read_bytes(path, expected))
+    with refused_as(path, expected):
+        rows = csv.DictReader(lines, skipinitialspace=True)
+        names = [name.strip() for name in rows.fieldnames or ()]
+        rows.fieldnames = names
+        found = [(rows.line_num, cells) for cells in rows]
+    for line, cells in found:
+        if None in cells:
+            raise bad_data(path, "too many cells", f"{len(names)}", row=line)
+    return names, [(n, {k: v for k, v in row.items() if v is not None}) for n, row in found]
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:

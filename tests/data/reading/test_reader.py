@@ -291,7 +291,7 @@ def test_parquet_reads_as_csv_does(root):
         read_log(path, layout)
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(
-        DataError, match=r"run.parquet: not Parquet.*expected a complete Parquet file"
+        DataError, match=r"run.parquet: cannot be read .*expected a complete Parquet file"
     ):
         read_log(path, layout)
 

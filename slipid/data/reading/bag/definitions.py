@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Union, cast
 
-from slipid.support.errors import DataError, bad_data
+from slipid.support.errors import DataError, bad_data, refused_as
 
 if TYPE_CHECKING:
     import rosbags.interfaces
@@ -92,7 +92,7 @@ def definition_of(
         DataError: the type is defined nowhere, or its definition cannot be read.
     """
     try:
-        return _message(name, _parsed(name, carried), folder)
+        return _message(where, name, _parsed(where, name, carried), folder)
     except NoDefinition as error:
         missing = error.args[0]
         also = "" if missing == name else f", which {name} contains"
@@ -101,30 +101,36 @@ def definition_of(
             f"{where}: no definition of {missing}{also} in the bag; {nor}expected one: name a "
             'folder of its .msg files in the layout (definitions = "FOLDER")'
         ) from None
-    except DataError:
-        raise
-    except Exception as error:  # the parser fails in many ways on arbitrary bytes
-        found = f"the definition of {name} cannot be read ({error})"
-        expected = "the text of a .msg file; is the bag damaged?"
-        raise bad_data(where, found, expected) from error
 
 
 def _message(
-    name: str, own: "rosbags.interfaces.typing.Typesdict", folder: Path | None
+    where: str,
+    name: str,
+    own: "rosbags.interfaces.typing.Typesdict",
+    folder: Path | None,
+    above: tuple[str, ...] = (),
 ) -> MessageType:
     """Return a message type with all nested types; raise `NoDefinition` if one is not found.
 
     Args:
+        where: bag and topic, for error messages.
         name: name of the type.
         own: definitions in the bag itself, as rosbags parsed them.
         folder: folder of .msg files, in which types that `own` lacks are searched, or None.
+        above: names of the types that contain this one.
+
+    Raises:
+        DataError: a definition in the folder cannot be read, or a type contains itself.
     """
     from rosbags.interfaces import Nodetype
+
+    if name in above:
+        raise bad_data(where, f"the type {name} contains itself", "a type that ends")
 
     def field_type(description: "rosbags.interfaces.typing.FieldDesc") -> FieldType:
         what, detail = description
         if what == Nodetype.NAME:
-            return _message(str(detail), own, folder)
+            return _message(where, str(detail), own, folder, (*above, name))
         if what == Nodetype.BASE:
             base = str(detail[0])
             if base != "string" and base not in _DTYPES:
@@ -140,21 +146,22 @@ def _message(
 
 
 def _parsed(
-    name: str, carried: "rosbags.interfaces.MessageDefinition"
+    where: str, name: str, carried: "rosbags.interfaces.MessageDefinition"
 ) -> "rosbags.interfaces.typing.Typesdict":
     """Return the types in the text of a definition; empty if the bag has no definition."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
-    if carried.format == MessageDefinitionFormat.MSG:
-        return get_types_from_msg(carried.data, name)
     if carried.format == MessageDefinitionFormat.NONE:
         return {}
-    types: rosbags.interfaces.typing.Typesdict = {}
-    for part in carried.data.split(_SEPARATOR):
-        if part.strip():
-            text = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
-            types.update(get_types_from_idl(text))
+    with refused_as(where, f"the definition of {name}; is the bag damaged?"):
+        if carried.format == MessageDefinitionFormat.MSG:
+            return get_types_from_msg(carried.data, name)
+        types: rosbags.interfaces.typing.Typesdict = {}
+        for part in carried.data.split(_SEPARATOR):
+            if part.strip():
+                text = part.partition("\n")[2] if part.startswith("IDL: ") else part
+                types.update(get_types_from_idl(text))
     return types
 
 
@@ -171,7 +178,10 @@ def _from_folder(
 
     package, short = name.split("/", 1)[0], name.rsplit("/", 1)[-1]
     files = sorted(folder.rglob(f"{short}.msg"), key=lambda path: package not in path.parts)
-    return get_types_from_msg(files[0].read_text("utf-8"), name)[name] if files else None
+    if not files:
+        return None
+    with refused_as(files[0], f"the definition of {name}"):
+        return get_types_from_msg(files[0].read_text("utf-8"), name)[name]
 
 
 @lru_cache(maxsize=1)

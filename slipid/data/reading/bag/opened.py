@@ -1,5 +1,6 @@
 """An open bag with its topics and messages; any damage is reported as a `DataError`."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -11,8 +12,10 @@ from slipid.data.reading.bag.definitions import MessageType, definition_of
 from slipid.data.reading.bag.shape import MessageShape, shape_of
 from slipid.data.reading.bag.storage import OPENABLE, BagFiles, RepairedMcap, files_of, repaired
 from slipid.data.reading.bag.ulog import UlogConnection, UlogReader, ulog_reader
+from slipid.data.reading.bag.unpacking import limit_rosbags
 from slipid.support.errors import DataError, bad_data
 from slipid.support.extras import require
+from slipid.support.files import read_bytes
 
 if TYPE_CHECKING:
     import rosbags.interfaces
@@ -27,6 +30,10 @@ _REMEDY = {
     "mcap": "save what is left with: mcap recover {file} -o whole.mcap",
     "ulog": "download {file} from the robot again",
 }
+MOST_METADATA = 2**20
+"""Largest size of metadata.yaml, which is read slowly [byte]."""
+MOST_REFERENCES = 20
+"""Largest number of references in metadata.yaml, which has none if ROS wrote it."""
 _METADATA = "copy the folder again, or run: ros2 bag reindex {file}"
 
 
@@ -135,6 +142,8 @@ class OpenBag:
                 for connection, received, data in _source(reader)(wanted):
                     if data.__class__ is not bytes:
                         raise TypeError(f"a message of type {type(data).__name__}")
+                    if received.__class__ is not int or not 0 <= received < 2**63:
+                        raise TypeError(f"a message of the time {received!r:.40}")
                     yield connection.topic, received, data
             except Exception as error:  # rosbags raises many types of errors on damaged bytes
                 raise damage_error(self.files, error) from error
@@ -222,12 +231,31 @@ def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Re
             return ulog_reader(files.path)
         from rosbags import rosbag1, rosbag2
 
+        limit_rosbags()
         if files.storage == "rosbag1":
             return stack.enter_context(rosbag1.Reader(files.path))
+        if files.metadata is not None and path == files.path:
+            _check_metadata(files.metadata)
         # `RepairedMcap` has the methods of a path that rosbags calls.
-        return stack.enter_context(rosbag2.Reader(cast(Path, path)))
+        reader = stack.enter_context(rosbag2.Reader(cast(Path, path)))
+        # metadata.yaml may have values of any type; `files`, which slipid does not need, is cleared
+        vars(reader.storage)["files"] = []
+        for one in reader.connections:
+            if (type(one.topic), type(one.msgtype), type(one.msgcount)) != (str, str, int):
+                raise TypeError(f"metadata of the topic {one.topic!r:.40} of wrong types")
+        return reader
     except Exception as error:  # rosbags and pyulog raise many types on damaged bytes
         raise damage_error(files, error) from error
+
+
+def _check_metadata(path: Path) -> None:
+    """Raise `ValueError` for a metadata.yaml that ROS cannot have written.
+
+    The text of a value with references may be exponential in their number.
+    """
+    raw = read_bytes(path, "the metadata of a bag", MOST_METADATA)
+    if len(re.findall(rb"(?:^|[\s,:\[{-])\*\w", raw)) > MOST_REFERENCES:
+        raise ValueError("metadata with many references")
 
 
 def damage_error(files: BagFiles, error: Exception) -> DataError:

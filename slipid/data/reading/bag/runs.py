@@ -1,6 +1,5 @@
 """Begin and end of the runs in a bag, which are separated by a topic, by pauses or by a table."""
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -20,6 +19,7 @@ from slipid.data.reading.bag.shape import MessageShape, without_indices
 from slipid.data.reading.bag.streams import Located
 from slipid.data.reading.layout import TURNS
 from slipid.data.reading.signal import Signal
+from slipid.data.reading.table import named_rows
 from slipid.support.errors import bad_data, did_you_mean
 from slipid.support.toml_file import Section, checked
 
@@ -193,21 +193,15 @@ def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
         DataError: the table is missing or wrong; the message names the row.
     """
     file = path.parent / str(rule.table)
-    try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        expected = "a CSV table of runs with the columns start and end"
-        raise bad_data(file, f"cannot be read ({error})", expected) from error
     found = []
-    reader = csv.DictReader(lines, skipinitialspace=True)
-    for cells in reader:
-        filled = {name: cell for name, cell in cells.items() if name and cell is not None}
-        row = checked(f"{file} row {reader.line_num}", filled, _RunRow)
+    _, rows = named_rows(file, "a CSV table of runs with the columns start and end")
+    for line, cells in rows:
+        row = checked(f"{file} row {line}", {k: v for k, v in cells.items() if k}, _RunRow)
         if row.bag not in ("", path.name, path.stem):
             continue
         if not row.start < row.end:
             times = f"a run from {row.start:g} to {row.end:g} s"
-            raise bad_data(file, times, "start before end", row=reader.line_num)
+            raise bad_data(file, times, "start before end", row=line)
         suffix = f"#{row.name}" if row.name else ""
         names = suffix, row.surface or None, row.load or None
         found.append(RunSpan(zero + row.start, zero + row.end, *names))

@@ -4,7 +4,9 @@ A message of a ULog file is packed like a message of ROS 1 whose arrays have fix
 same code finds the numbers in both. The package pyulog reads the file.
 """
 
+import io
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,8 @@ _DTYPES = {
     **{"float": "f4", "double": "f8", "bool": "b1", "char": "u1"},
 }
 _PADDING = "_padding"
+MOST_BYTES = 2**16
+"""Limit of the size of a record [byte]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +67,57 @@ class UlogReader:
 
 
 def ulog_reader(path: Path) -> UlogReader:
-    """Return the reader of a ULog file; pyulog raises many types of errors on damaged bytes."""
+    """Return the reader of a ULog file; pyulog raises many types of errors on damaged bytes.
+
+    What pyulog prints about damage is not shown.
+    """
     import pyulog
 
-    with path.open("rb") as file:
-        log = pyulog.ULog(file)
+    raw = path.read_bytes()
+    with redirect_stdout(io.StringIO()):
+        formats = pyulog.ULog(_Once(raw), parse_header_only=True).message_formats
+        sizes: dict[str, int] = {}
+        for name in formats:
+            _check_size(name, formats, sizes)
+        log = pyulog.ULog(_Once(raw))
     return UlogReader([_connection(one, log.message_formats) for one in log.data_list])
+
+
+class _Once(io.BytesIO):
+    """Bytes of a file that are read a limited number of times: pyulog may go back without end."""
+
+    def __init__(self, raw: bytes) -> None:
+        super().__init__(raw)
+        self.left = 1000 + 4 * len(raw)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes."""
+        block = super().read(size)
+        self.left -= len(block) + 1
+        if self.left < 0:
+            raise OSError("damaged records")
+        return block
+
+
+def _check_size(name: str, formats: Mapping[str, Any], sizes: dict[str, int]) -> int:
+    """Return the number of bytes of messages with a format, and remember it in `sizes`.
+
+    Raises:
+        ValueError: the messages are larger than a record, or contain themselves.
+    """
+
+    def size_of(kind: str) -> int:
+        if kind in _DTYPES:
+            return np.dtype(_DTYPES[kind]).itemsize
+        return _check_size(kind, formats, sizes) if kind in formats else 0
+
+    if name not in sizes:
+        sizes[name] = MOST_BYTES  # of a format that contains itself
+        fields = formats[name].fields
+        sizes[name] = sum(max(n, 1) * size_of(kind) for kind, n, _ in fields)
+    if sizes[name] >= MOST_BYTES:
+        raise ValueError(f"messages '{name}' of over {MOST_BYTES} bytes")
+    return sizes[name]
 
 
 def _connection(one: Any, formats: Mapping[str, Any]) -> UlogConnection:

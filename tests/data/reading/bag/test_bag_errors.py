@@ -362,5 +362,7 @@ def test_a_definition_that_is_nowhere(tmp_path):
     ):
         runs_of(path, declared_bag_layout(given, "layout"))
     (tmp_path / "Inner.msg").write_text("float32 ; x\n")
-    with pytest.raises(DataError, match=r"the definition of my_msgs/msg/Amps cannot be read"):
+    with pytest.raises(
+        DataError, match=r"Inner.msg: cannot be read .*the definition of my_msgs/msg/Inner"
+    ):
         runs_of(path, declared_bag_layout(given, "layout"))

@@ -141,7 +141,7 @@ def test_a_table_of_stamps(tmp_path):
         ("start,end\n1,2\n5,soon\n", ("row 3: end: 'soon'", "a valid number")),
         ("start,end\n2,1\n", ("row 2: a run from 2 to 1 s", "start before end")),
         ("start,end\n1,2\n", ("no run of table", "1700000000.000", "from_start = true")),
-        (None, ("runs.csv: cannot be read", "CSV table of runs")),
+        (None, ("runs.csv: No such file", "CSV table of runs")),
     ],
 )
 def test_wrong_tables(tmp_path, text, words):
