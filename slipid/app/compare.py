@@ -4,20 +4,32 @@ This is the work of `slipid compare` and `slipid validate` except their pictures
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Int
 
 from slipid.app.calibrate import calibrated, read_calibration
 from slipid.app.config import Config, read_config, single_floor_sections
 from slipid.app.floor_maps import map_files
 from slipid.app.identify import with_mixed_runs
 from slipid.app.logs import read_dataset
-from slipid.app.problem import ConfigFitTask, read_fit_task, shape_of, with_mixed
+from slipid.app.problem import (
+    ConfigFitTask,
+    FitTask,
+    lag_from_motion,
+    read_fit_task,
+    shape_of,
+    with_mixed,
+)
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
+from slipid.data.windows import steady_duration
+from slipid.fitting.calibration.estimate import calibrate
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
@@ -30,6 +42,7 @@ from slipid.predict.ranking import ranking, transfer
 from slipid.predict.selection import calibrated_model
 from slipid.predict.slip_models import FloorModels
 from slipid.predict.validation import ScoredRun, Validation, validation
+from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -40,6 +53,7 @@ from slipid.support.progress import Reporter
 SCHEMA = "slipid.comparison/1"
 FOLDS = "folds"
 """Name of the folder, inside the result folder, with the checkpoints of finished folds."""
+_Task = TypeVar("_Task", bound=FitTask)
 
 
 def compare(
@@ -61,7 +75,7 @@ def compare(
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
-    task = with_mixed(read_fit_task(config, data, report), data, report)
+    read = task = with_mixed(read_fit_task(config, data, report), data, report)
     refuse_misordered(task.logs)
     folds_by_question = {name: folds_of(task.dataset, name) for name in dict.fromkeys(questions)}
     for name in [name for name, fold in folds_by_question.items() if (fold < 0).all()]:
@@ -80,7 +94,7 @@ def compare(
     kept = Checkpoint(out / FOLDS, key_of(config.hash, task.data_hash, *names, maps))
     problem, whole = _of_all_runs(task, problem, kept, report)
     robot = problem.space.tree(np.asarray(whole["z"], float))
-    results = _folds(task, problem, folds_by_question, kept, report)
+    results = _folds(read, problem, folds_by_question, kept, report)
     surfaces = transfer(problem.windows, robot) if problem.windows.has_current else {}
     content: Content = {
         "schema": SCHEMA,
@@ -190,8 +204,10 @@ def _folds(
 ) -> dict[str, list[Content]]:
     """Return the results of all folds, keyed by the kind of fold.
 
+    Runs over several floors are cut into windows once, for the fit to all runs.
+
     Args:
-        task: the fit task.
+        task: the fit task, not started from a calibration.
         problem: likelihood of all runs.
         folds_by_question: index of each run's fold, keyed by the kind of fold.
         kept: checkpoint of finished fits.
@@ -202,11 +218,13 @@ def _folds(
     others = [data for data, _ in task.mixed]
 
     def one(name: str, held_out: np.ndarray) -> Content:
-        beside = None
+        beside, own = None, without(task, held_out)
+        alone = own.problem()
         if problem.multi_floor is not None:
             runs = like_held_out(task.dataset, held_out, others, name)
             beside = runs[problem.multi_floor.windows.run]
-        found = judge(problem, task.choices, task.dataset, name, held_out, fit, beside)
+            alone = alone.with_multi_floor(problem.multi_floor)
+        found = judge(alone, own.choices, task.dataset, name, held_out, fit, beside)
         return found.to_json()
 
     work: dict[tuple[str, int], Callable[[], Content]] = {
@@ -220,6 +238,28 @@ def _folds(
         done[name].append(finished(kept, f"{name}_{k}", make))
         report.advance(count, len(work), f"{count} of {len(work)} folds, {name}")
     return done
+
+
+def without(task: _Task, held_out: Int[np.ndarray, " some"]) -> _Task:
+    """Return a task that was prepared without any measurement of held-out runs.
+
+    The prior of the lag, the start of the fit and the length of the windows, which runs show, are
+    those of the other runs. The held-out runs stay in the task and are cut into such windows, too.
+
+    Args:
+        task: fit task of all runs, not started from a calibration.
+        held_out: indices of the held-out runs.
+    """
+    rest = task.dataset.subset(np.setdiff1d(np.arange(len(task.dataset)), held_out))
+    split = len(task.choices) - task.user_choices
+    known = [c for c in task.choices[:split] if c.pattern != "camera.lag"]
+    given = any(fnmatchcase("camera.lag", c.pattern) for c in task.choices[split:])
+    lag = [] if given else lag_from_motion(rest)
+    choices = (*lag, *known, *task.choices[split:])
+    longest = task.settings.longest_window_s or steady_duration(rest)
+    settings = task.settings.model_copy(update={"longest_window_s": longest})
+    found = calibrate(rest, Space(task.robot, choices), choices)
+    return replace(task, choices=choices, settings=settings).started_from(found)
 
 
 def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:

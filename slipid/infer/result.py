@@ -286,6 +286,9 @@ class Fit:
     def compare(self, question: str = "sectors", parts: int = 6, quiet: bool = False) -> Comparison:
         """Compare slip models by cross-validation: each is refitted and scored on held-out runs.
 
+        Starts, the prior of the lag and the windows remain those of this fit; `slipid compare`
+        takes them from the runs that are not held out.
+
         Args:
             question: grouping of the runs that are held out together: `sectors` of 60 degrees of
                 headings, `speeds`, or `random` headings.

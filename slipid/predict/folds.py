@@ -225,9 +225,10 @@ def fit_fold(
 ) -> FoldModels:
     """Return every slip model, fitted to all runs except `judged`; arguments as in `judge`.
 
-    No measurement of the held-out runs is used. If the problem has runs over several floors, the
-    force balance is fitted to the other runs first and then to all; the other slip models only
-    take its camera.
+    No measurement of the held-out runs is used, but for what the problem was made with: the priors,
+    the start, and the lag and duration for which windows were cut. If the problem has runs over
+    several floors, the force balance is fitted to the other runs first and then to all; the other
+    slip models only take its camera.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
     problem = problem_of_runs(problem, choices, data, fitted)

@@ -50,3 +50,13 @@ def test_many_runs_print_at_most_30_lines():
     assert len(lines) <= 30
     assert "  and 34 more floors and load set-ups" in lines
     assert "  and 34 more sessions" in lines
+
+
+def test_readings_of_a_run_without_marks_are_all_new():
+    fresh = np.zeros((101, 2), bool)
+    fresh[::10] = True
+    logs = [run(0, "oak"), run(1, "oak")]
+    volts = np.ones((101, 2))
+    logs = [replace(logs[0], voltage=volts, voltage_fresh=fresh), replace(logs[1], voltage=volts)]
+    np.testing.assert_array_equal(collect(logs).voltage_fresh, np.vstack([fresh, fresh | True]))
+    assert collect(logs[1:]).voltage_fresh is None

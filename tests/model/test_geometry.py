@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.model.geometry import Geometry, general, mecanum, omni, skid_steer
+from slipid.model.geometry import Geometry, general, mecanum, omni, skid_steer, steered
 
 ROBOTINO = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
 GEOMETRIES = {
@@ -184,3 +184,9 @@ def test_the_mirror_of_a_body(made, axis):
     if axis is not None:  # one wheel that drives another way has no image
         turned = (made.drive_angle[0] + 0.1, *made.drive_angle[1:])
         assert replace(made, drive_angle=turned).mirror() is None
+
+
+def test_wheels_without_rollers_grip():
+    assert steered(0.3, 0.05, 1.0, "rear", 2).grips == (True, True)
+    assert skid_steer(0.2, 0.15, 0.05).grips == (True,) * 4
+    assert ROBOTINO.grips == (False,) * 3

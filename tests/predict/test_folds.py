@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 from scipy.stats import binom, chi2, multivariate_t
 from typer.testing import CliRunner
 
+from slipid.app import compare
 from slipid.app.compare import finished
 from slipid.app.logs import packaged_config
 from slipid.cli.main import app
@@ -413,7 +414,14 @@ def test_what_runs_of_one_speed_cannot_tell_is_held_unless_the_user_says_otherwi
 
 
 @pytest.mark.slow
-def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
+def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs, monkeypatch):
+    held_out, of_others = [], compare.without
+
+    def spied(task, runs):
+        held_out.extend(runs.tolist())
+        return of_others(task, runs)
+
+    monkeypatch.setattr(compare, "without", spied)
     write_logs(logs, true_robot(PLAN), tmp_path / "logs", tmp_path / "truth")
     (tmp_path / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
     out = tmp_path / "out"
@@ -421,6 +429,7 @@ def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
     words = [str(word) for word in (*words, "--folds", "speeds", "--quiet")]
     first = CliRunner().invoke(app, words)
     assert first.exit_code == 0, first.output
+    assert sorted(held_out) == list(range(len(PLAN)))  # each fold started without its runs
     assert (out / "comparison.png").stat().st_size > 10_000
     before = json.loads((out / "comparison.json").read_text())
     floor = before["questions"]["speeds"]["floors"]["soft"]

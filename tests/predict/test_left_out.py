@@ -6,8 +6,9 @@ from functools import partial
 import numpy as np
 import pytest
 
+from slipid.app.compare import without
 from slipid.app.config import FitSection
-from slipid.app.problem import FitTask, robot_for_runs
+from slipid.app.problem import FitTask, lag_from_motion, robot_for_runs
 from slipid.data.runs import collect
 from slipid.fitting.optimise import optimise
 from slipid.lab.selftest.logs import (
@@ -178,6 +179,30 @@ def test_a_step_without_a_fold_uses_nothing_of_it(logs, learnt):
     now = contact_errors(other.dataset, other.problem(), learnt.optimum)
     assert now[witness] == before[witness] < 0.1
     assert (now[spoilt] != before[spoilt]).all()
+
+
+def test_no_bit_of_how_a_fold_starts_depends_on_left_out_runs(logs, judged):
+    """Neither the prior of the lag nor the geometry nor the windows of the other runs."""
+    rng = np.random.default_rng(0)
+
+    def late(log):
+        return replace(backwards(log, rng), pose=np.roll(log.pose, 20, axis=0))
+
+    whole = [
+        task_of(logs),
+        task_of([late(log) if k in judged else log for k, log in enumerate(logs)]),
+    ]
+    whole = [replace(t, choices=(*lag_from_motion(t.dataset), *CHOICES[1:])) for t in whole]
+    one, other = (without(task, judged) for task in whole)
+    assert whole[0].choices != whole[1].choices
+    assert one.choices == other.choices
+    assert [c.pattern for c in one.choices] == ["camera.lag", "camera.scale", "camera.lag"]
+    first, second = (task.problem().windows for task in (one, other))
+    kept = np.flatnonzero(~np.isin(first.run, judged))
+    assert first.lag == second.lag == one.choices[-1].start
+    for name in ("dt", "turn", "pose", "current", "voltage"):
+        x, y = (getattr(w.segments(kept), name) for w in (first, second))
+        np.testing.assert_array_equal(x, y, err_msg=name)
 
 
 def judge_as(found, task, judged):

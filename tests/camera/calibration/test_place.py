@@ -11,7 +11,7 @@ from slipid.camera.calibration.board import view_of
 from slipid.camera.calibration.calibrate import CalibratedLens, floor_from_board
 from slipid.camera.calibration.place import fit_place, fit_place_robustly, uncertainty
 from slipid.camera.calibration.points import read_points
-from slipid.camera.calibration.report import marker_height, mm_per_pixel
+from slipid.camera.calibration.report import floor_report, marker_height, mm_per_pixel
 from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.support.errors import DataError
 from tests.helpers import made_boards as made
@@ -107,6 +107,15 @@ def test_a_bad_point_is_left_out_or_reported():
     assert np.abs(fit.camera.place - [0.1, -0.2, 2.4]).max() < 0.02
     assert not fit.disputed
     assert fit_place_robustly("here", LENS, floor_points(GRID)[0]).left_out == ()
+
+
+@pytest.mark.parametrize(("noise", "is_poor"), [(1.0, False), (2.0, True)])
+def test_points_that_are_off_by_two_pixels_are_reported(noise, is_poor):
+    points, _ = floor_points(GRID, noise=noise)
+    fit = fit_place("here", LENS, points)
+    assert noise < fit.rms_px < 1.5 * noise
+    sentences = floor_report("here", fit, uncertainty(fit, None), 0.001)["poor"]
+    assert any("points on the floor are off by" in one for one in sentences) == is_poor
 
 
 def test_a_point_that_is_anywhere_is_left_out():

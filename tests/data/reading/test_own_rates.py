@@ -316,3 +316,17 @@ def test_real_skid_steer_logs_are_read_and_wild_poses_set_aside(real_data):
     found = read_logs(path, layout, real_data, "wet_grass", "as_built")
     assert not found.logs
     assert "husky_wetgrass/step_01.csv row" in found.aside[0]
+
+
+def test_a_missing_reading_is_the_last_one(tmp_path):
+    """Also where all other readings come with those of the encoders."""
+    t = np.arange(0, 2.0, 0.05)
+    rows = [[x, *angle(x), *pose(x), x, 2 * x] for x in t]
+    rows[7][-1] = None
+    csv(tmp_path / "run.csv", ["t", "left", "right", "x", "y", "yaw", "u1", "u2"], rows)
+    columns = {**ONE_FILE["columns"], "voltage": {"columns": ["u1", "u2"], "unit": "V"}}
+    data = one(tmp_path, {"columns": columns})
+    expected = np.stack([t, 2 * t], axis=1)
+    expected[7, 1] = expected[6, 1]
+    np.testing.assert_allclose(data.voltage, expected, atol=1e-8)
+    assert not data.voltage_fresh[7, 1]
