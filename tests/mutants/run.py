@@ -47,7 +47,8 @@ LEFT_OUT = shutil.ignore_patterns(".*", "__pycache__", "demo_out", "out")
 VERDICTS = {0: "survived", 1: "killed", 2: "killed"}
 """By exit code of pytest; any other one is an error."""
 BROKEN = re.compile(
-    r"(?!FAILED|ERROR )|ERROR (?!\S*::|.* - )|.*(ImportError|ModuleNotFoundError|fixture '\w+' not found)"
+    r"(?!FAILED|ERROR )|ERROR (?!\S*::|.* - )"
+    r"|.*(ImportError|ModuleNotFoundError|fixture '\w+' not found)"
 )
 """Lines of what was not found, imported or set up: no failure of a test."""
 LEAST_KILLED = 0.9
