@@ -438,3 +438,11 @@ def test_wheels_that_tremble_at_rest_do_not_move():
     noise = 1e-3 * np.random.default_rng(0).normal(size=log.wheel_angle.shape)
     w = windows(collect([replace(log, wheel_angle=log.wheel_angle + noise)]), RADIUS)
     assert (np.abs(w.direction[:, -1]) < 0.01).all()
+
+
+def test_wheels_that_turn_evenly_change_no_speed():
+    """Neither at the first pose, which the log does not begin long before, nor at the last one."""
+    log = run(start=0.0)
+    turned = np.outer(log.time - log.time[0], [3.0, -2.0, 1.5])
+    w = windows(collect([replace(log, wheel_angle=turned)]), RADIUS)
+    np.testing.assert_allclose(w.speed_change, 0.0, atol=1e-9)

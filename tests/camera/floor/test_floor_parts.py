@@ -16,7 +16,7 @@ from slipid.camera.floor.light import (
     to_srgb,
 )
 from slipid.camera.floor.outline import outlines_of, signed_area
-from slipid.camera.floor.surfaces import smoothed, without_small_patches
+from slipid.camera.floor.surfaces import Surfaces, smoothed, without_small_patches
 from slipid.camera.overhead import OverheadCamera
 from tests.helpers.made_floors import COLOURS, aslant
 from tests.helpers.mapped_floors import IMAGE
@@ -135,6 +135,29 @@ def test_outlines_share_their_borders_and_keep_holes():
     # the edge of the hole in one is the edge of the other
     hole = {tuple(corner) for corner in patches[0].rings[1]}
     assert hole == {tuple(corner) for corner in square}
+
+
+def test_a_map_of_small_patches_alone_keeps_them():
+    labels = np.indices((8, 9)).sum(axis=0) % 2
+    found = without_small_patches(labels, np.full(labels.shape, True), 3)
+    np.testing.assert_array_equal(found, labels)
+
+
+def test_corners_of_the_map_stay_where_they_are():
+    """Also if lines may be off by more than what they would cut off there."""
+    labels = np.zeros((20, 30), int)
+    (one,) = outlines_of(labels, 3.0)
+    assert {tuple(corner) for corner in one.rings[0]} == {(0, 0), (30, 0), (30, 20), (0, 20)}
+
+
+def test_a_surface_costs_as_much_where_it_is_smoother_as_where_it_is_rougher():
+    lit = LitColours(Illumination.uniform(), np.array([[0.2, 0.3, 0.4]]))
+    surfaces = Surfaces(lit, np.array([0.5]), np.ones((1, 4)))
+    usual = surfaces.appearances((3, 4))[0].astype(float)
+    step = np.array([0.0, 0.0, 0.0, 0.4])
+    own, rougher, smoother = (surfaces.costs(usual + k * step) for k in (0, 1, -1))
+    np.testing.assert_allclose(rougher, own + 0.4**2, rtol=1e-3)
+    np.testing.assert_allclose(smoother, rougher, rtol=1e-3)
 
 
 def test_cells_that_touch_at_a_corner_are_outlined():

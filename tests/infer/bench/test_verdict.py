@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from slipid.infer.bench import fit as motor_fits
 from slipid.infer.bench.fit import MotorFit, fit_motor
 from slipid.infer.bench.held_out import Errors, HeldOut, folds, held_out
 from slipid.infer.bench.motor import BenchRecord
@@ -96,6 +97,18 @@ def test_errors_are_those_of_rows_that_a_fit_did_not_use(fit):
     found = held_out(fit.rows, lambda use: measured + np.array([0.5, 2.0])[:, None, None] * ~use)
     assert found.errors == Errors(speed=2.0, current=0.5)
     assert found.rivals == fit.held_out.rivals
+
+
+def test_a_motor_is_judged_by_fits_to_the_other_rows(fit, monkeypatch):
+    weights = []
+
+    def spied(rows, space, z, weight, *more):
+        weights.append(weight)
+        return fit.fit
+
+    monkeypatch.setattr(motor_fits, "fit_open_loop", spied)
+    motor_fits._held_out(fit.fit)
+    np.testing.assert_array_equal(weights, np.array(folds(fit.rows), float))
 
 
 def test_rows_without_weight_do_not_change_a_fit(fit):

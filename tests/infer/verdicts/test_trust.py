@@ -86,6 +86,10 @@ def test_the_worst_reason_comes_first():
     found = verdict_of_trust({"ice": floor(nominal=0.02, contact=0.03)}, False, [number()])
     assert "ice" in found.reasons[0]
     assert "converge" in found.reasons[1]
+    lone = {"ice": floor(held_out=False, nominal=0.1, contact=0.01)}
+    found = verdict_of_trust(lone, False, [number()])
+    assert "converge" in found.reasons[0]
+    assert "only one run" in found.reasons[1]
 
 
 def test_a_force_balance_that_is_not_selected_does_not_lower_the_trust():
