@@ -46,7 +46,7 @@ def track(
     with TemporaryDirectory() as folder, Reporter(quiet=quiet) as report:
         bodies: tuple[Target, ...]
         if isinstance(marker, LoneMarker):
-            bodies = (marker.target(source),)
+            bodies = (marker.target(source, report),)
         else:
             bodies = read_targets(Path(marker))
         return run(source, above, bodies, Path(folder) / "unfinished", report)

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from slipid.camera.frame import Frame, FrameSource, Times, even_times, grey_of, read_times, stamp
-from slipid.camera.opencv import cv2, is_picture, pictures_in, read_picture, size_of
+from slipid.camera.opencv import cv2, size_of
+from slipid.camera.picture_file import is_picture, pictures_in, read_picture
 from slipid.camera.video import Video
 from slipid.support.errors import DataError
 
@@ -126,7 +127,7 @@ class PictureFolder(FrameSource):
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """Yield the images from number `first`; raise `DataError` if an image has another size."""
         for k in range(first, len(self.paths)):
-            picture = read_picture(self.paths[k])
+            picture = read_picture(self.paths[k], self.notes)
             if size_of(picture) != self.image_px:
                 (w, h), (width, height) = size_of(picture), self.image_px
                 raise DataError(

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from slipid.camera.frame import Frame, FrameSource, Times, even_times, grey_of, stamp
-from slipid.camera.opencv import check_pixels, is_picture, read_picture
+from slipid.camera.opencv import MOST_PIXELS
+from slipid.camera.picture_file import is_picture, read_picture
 from slipid.support.errors import DataError
 from slipid.support.extras import require
 
@@ -60,7 +61,10 @@ class VideoStream:
                 "that was cut off may have lost its index)"
             ) from None
         context = self._stream.codec_context
-        check_pixels(path, context.width, context.height)
+        width, height = context.width, context.height
+        if width * height > MOST_PIXELS:
+            most = f"{MOST_PIXELS // 10**6} million at most"
+            raise DataError(f"{path}: frames of {width} x {height} pixels; expected {most}")
         self._stream.thread_type = "AUTO"
         self._reason: str | None = None
         # in Motion JPEG every frame stands for itself, and damage to one is no doubt about another
@@ -311,7 +315,8 @@ def still(path: Path) -> Still:
         DataError: the file is neither an image nor a video, or shows a single colour.
     """
     if is_picture(path) or not path.is_file() or not path.stat().st_size:
-        result = Still(read_picture(path), [], [])
+        notes: list[str] = []
+        result = Still(read_picture(path, notes), notes, [])
     else:
         result = _median_of(path)
     few, every = result.picture[::16, ::16], result.picture

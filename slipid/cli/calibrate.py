@@ -12,9 +12,10 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.camera.calibration.board import Board
+    from slipid.camera.calibration.board import PrintedBoard
     from slipid.camera.calibration.calibrate import CalibratedLens
     from slipid.camera.calibration.place import FloorFit
+    from slipid.camera.calibration.quality import TooLittleCovered
     from slipid.report.page import Page
 
 SIZE_STD = 0.001
@@ -26,12 +27,16 @@ def calibrate(
     pictures: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="PICTURE...", help="Pictures of a ChArUco board: files, folders or globs."
+            metavar="PICTURE...", help="Pictures of the board: files, folders or globs."
         ),
     ] = None,
     out: Annotated[Path, option("FILE", "Camera file to write.")] = Path("camera.json"),
     board: Annotated[
         str | None, option("7x5", "Number of squares of the ChArUco board along x and y.")
+    ] = None,
+    chessboard: Annotated[
+        str | None,
+        option("9x6", "Number of inner corners of a plain chessboard, instead of --board."),
     ] = None,
     square: Annotated[float | None, option("M", "Edge length of a square, in m.")] = None,
     marker: Annotated[float | None, option("M", "Edge length of a marker, in m.")] = None,
@@ -77,14 +82,16 @@ def calibrate(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Calibrate an overhead camera from pictures of a ChArUco board: its lens, and its pose.
+    """Calibrate an overhead camera from pictures of a printed board: its lens, and its pose.
 
-    The lens is calibrated from PICTURE... or read from --camera; the pose above the floor follows
-    from --floor or --points. With --floor, the origin of the world is on the floor below the middle
-    of the board, with x along the columns of the board, y along its rows, and z up. With --points,
-    the measured points define the axes. Without any calibration, --metres-per-pixel and
-    --lens-height describe a camera that looks straight down; the origin is then in the middle of
-    the picture, with x to the right and y up.
+    The board is a ChArUco board (--board 7x5 --square 0.04 --marker 0.03) or a plain chessboard
+    (--chessboard 9x6 --square 0.025), which can calibrate the lens alone. The lens is calibrated
+    from PICTURE... or read from --camera; the pose above the floor follows from --floor or
+    --points. With --floor, the origin of the world is on the floor below the middle of the board,
+    with x along the columns of the board, y along its rows, and z up. With --points, the measured
+    points define the axes. Without any calibration, --metres-per-pixel and --lens-height describe a
+    camera that looks straight down; the origin is then in the middle of the picture, with x to the
+    right and y up.
 
     For a lens at height H, a point at height h above the floor appears H / (H - h) times as far
     from the point below the lens as it is. With H = 2.4 m and h = 0.25 m, lengths would be 11.6 %
@@ -94,17 +101,19 @@ def calibrate(
     The exit code is 1 if the calibration is poor but usable; the file, which is written all the
     same, then contains the reasons.
     """
+    from slipid.camera.calibration.board import Board
     from slipid.camera.calibration.calibrate import (
         floor_from_board,
         floor_from_points,
         lens_from_file,
         lens_from_pictures,
     )
+    from slipid.camera.calibration.quality import TooLittleCovered
 
     words, described = pictures or [], (metres_per_pixel, lens_height, turn)
     std = SIZE_STD if size_std is None else _positive("--size-std", size_std)
     if any(value is not None for value in described):
-        if any((board, camera, floor, points)) or len(words) != 1:
+        if any((board, chessboard, camera, floor, points)) or len(words) != 1:
             raise DataError(
                 "--metres-per-pixel, --lens-height and --turn describe a camera without "
                 "calibration; expected a single picture with them, and no --board, --camera, "
@@ -113,18 +122,22 @@ def calibrate(
         return _uncalibrated(Path(words[0]), described, size_std, out, json)
     _refuse_combinations(words, camera, floor, points)
     with Reporter(quiet=quiet) as report:
-        edges = square, marker
-        seen = _board(board, edges, dictionary, legacy) if words or floor is not None else None
-        report.stage("reading pictures")
+        sizes = board, chessboard
+        seen = None
+        if words or floor is not None:
+            seen = _board(sizes, (square, marker), dictionary, legacy, floor is not None)
         if camera is not None:
             lens = lens_from_file(camera)
         else:
             assert seen is not None  # a board is required if there are pictures
-            lens = lens_from_pictures(words, seen, k3)
+            try:
+                lens = lens_from_pictures(words, seen, k3, report)
+            except TooLittleCovered as error:
+                raise _with_picture(error, out, report) from None
         fit = None
         if points is not None:
             fit = floor_from_points(lens, points, std)
-        elif floor is not None and seen is not None:
+        elif floor is not None and isinstance(seen, Board):
             if not 0 <= board_height < math.inf:
                 raise DataError(
                     f"--board-height {board_height:g}; expected a height in metres, 0 or more"
@@ -163,17 +176,41 @@ def _positive(option: str, value: float | None) -> float:
 
 
 def _board(
-    size: str | None, edges: tuple[float | None, float | None], dictionary: str, legacy: bool
-) -> "Board":
+    sizes: tuple[str | None, str | None],
+    edges: tuple[float | None, float | None],
+    dictionary: str,
+    legacy: bool,
+    on_floor: bool,
+) -> "PrintedBoard":
     """Return the board that the options describe.
 
-    `edges` are the edge lengths of a square and of a marker [m].
+    Args:
+        sizes: values of --board and --chessboard.
+        edges: edge lengths of a square and of a marker [m].
+        dictionary: dictionary of the markers.
+        legacy: True for a board drawn by an old version of OpenCV.
+        on_floor: True if the board also determines the pose above the floor.
     """
-    from slipid.camera.calibration.board import board_of
+    from slipid.camera.calibration.board import board_of, chessboard_of
 
+    size, inner = sizes
+    if inner is not None:
+        if size is not None or edges[1] is not None:
+            raise DataError(
+                "--chessboard is given with --board or --marker; expected --chessboard and "
+                "--square for a plain chessboard, or --board, --square and --marker for a board "
+                "with markers"
+            )
+        if on_floor:
+            raise DataError(
+                "--floor is given with --chessboard, which looks the same after half a turn; "
+                "expected a ChArUco board on the floor, or --points CSV"
+            )
+        return chessboard_of(inner, _positive("--square", edges[0]))
     if size is None:
         raise DataError(
-            "--board is missing; expected the numbers of squares along x and y, such as 7x5"
+            "--board is missing; expected the numbers of squares along x and y, such as 7x5 "
+            "(or --chessboard, for a board without markers)"
         )
     square, marker = map(_positive, ("--square", "--marker"), edges)
     return board_of(size, square, marker, dictionary, legacy)
@@ -214,8 +251,9 @@ def _write(
     if can_draw(report):
         from slipid.plots.calibration import coverage_picture, floor_picture
 
-        if lens.quality is not None:
-            files.append(coverage_picture(lens.quality, out.with_name(f"{out.stem}_coverage.png")))
+        if (quality := lens.quality) is not None:
+            shown = quality.fit, quality.coverage, quality.held_out_px
+            files.append(coverage_picture(*shown, _coverage_file(out)))
         if fit is not None:
             files.append(floor_picture(fit, out.with_name(f"{out.stem}_floor.png")))
     content = read_json(out, "the camera file that was just written")
@@ -223,6 +261,21 @@ def _write(
     following = _following(out) if fit is not None else []
     emit(json, content, lambda page: _show(page, about, fresh), following, out.parent, names)
     return 1 if about.get("poor") else 0
+
+
+def _with_picture(error: "TooLittleCovered", out: Path, report: Reporter) -> DataError:
+    """Write the picture of the coverage of a refused lens, and return the error that names it."""
+    if not can_draw(report):
+        return error
+    from slipid.plots.calibration import coverage_picture
+
+    path = coverage_picture(error.fit, error.coverage, None, _coverage_file(out))
+    return DataError(f"{error}; {path} shows them")
+
+
+def _coverage_file(out: Path) -> Path:
+    """Return the file of the picture of the coverage beside a camera file."""
+    return out.with_name(f"{out.stem}_coverage.png")
 
 
 def _following(camera: Path) -> list[Next]:

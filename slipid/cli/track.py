@@ -97,10 +97,9 @@ def track(
                 "--marker-height in metres, or --targets FILE"
             )
         else:
-            report.stage("searching for the marker")
             yaw = math.radians(marker_yaw)
             lone = tracking.LoneMarker(marker_size, marker_height, id, dictionary, yaw)
-            bodies = (lone.target(frames, part),)
+            bodies = (lone.target(frames, report, part),)
         unfinished = out.with_name(f".{out.name}.unfinished")
         with locked(unfinished, "track"):
             result = tracking.track(frames, above, bodies, unfinished, report, part)

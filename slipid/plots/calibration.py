@@ -8,25 +8,32 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from slipid.camera.calibration.lens import LensFit
 from slipid.camera.calibration.place import FloorFit
-from slipid.camera.calibration.quality import Quality
+from slipid.camera.calibration.quality import Coverage
 from slipid.camera.overhead import OverheadCamera
 from slipid.plots.drawing import BLUE, GREEN, INK, ORANGE, figure, save
 
 ARROW_LENGTH = 0.06
 """Largest length at which the 95 % quantile of residuals is drawn, as a fraction of the image
 width."""
+UP = "offset points"
 GRID_STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
 """Possible distances between grid lines drawn on the floor [m]."""
 
 
-def coverage_picture(quality: Quality, path: Path) -> Path:
-    """Write a figure of a lens fit: corners with residuals, and image cells without corners."""
-    fit, covered = quality.fit, quality.coverage
+def coverage_picture(
+    fit: LensFit, covered: Coverage, held_out_px: float | None, path: Path
+) -> Path:
+    """Write a figure of a lens fit: corners with residuals, and image cells without corners.
+
+    `held_out_px` is the error on held-out views, None for a lens that is refused [pixel].
+    """
     width, height = fit.lens.image_px
+    held_out = "" if held_out_px is None else f", {held_out_px:.2f} px on held-out views"
     title = (
         f"Corners in {covered.visited.sum()} of {covered.visited.size} cells; "
-        f"rms error {fit.rms_px:.2f} px, {quality.held_out_px:.2f} px on held-out views"
+        f"rms error {fit.rms_px:.2f} px{held_out}"
     )
     drawing, axes = _frame(title, width, height)
     down, across = covered.visited.shape
@@ -36,6 +43,10 @@ def coverage_picture(quality: Quality, path: Path) -> Path:
         axes.add_patch(Rectangle(corner, *size, fc=ORANGE, ec=ORANGE, alpha=0.18, lw=0))
     if not covered.visited.all():
         axes.add_patch(Rectangle((0, 0), 0, 0, fc=ORANGE, alpha=0.18, label="never visited"))
+    for k in range(across):
+        axes.annotate(f"{k + 1}", ((k + 0.5) * size[0], 0), (0, 3), textcoords=UP, ha="center")
+    for k in range(down):
+        axes.annotate(f"{k + 1}", (width, (k + 0.5) * size[1]), (4, 0), textcoords=UP, va="center")
     axes.set_xticks(np.arange(across + 1) * size[0] - 0.5, minor=True)
     axes.set_yticks(np.arange(down + 1) * size[1] - 0.5, minor=True)
     axes.grid(which="minor", color="#dddddd", lw=0.6)

@@ -75,7 +75,13 @@ def test_speed(video, tmp_path):
     def whole() -> None:
         source = open_source(str(path))
         done = track(
-            *(source, camera, (ROBOT.target(source),), tmp_path / "kept", Reporter(quiet=True))
+            *(
+                source,
+                camera,
+                (ROBOT.target(source, Reporter(quiet=True)),),
+                tmp_path / "kept",
+                Reporter(quiet=True),
+            )
         )
         done.write(tmp_path / "poses.csv")
 
@@ -123,7 +129,13 @@ def test_accuracy_on_the_test_site(tmp_path, speed):
     yaw = float(np.radians(robot.marker_yaw_deg))
     marker = LoneMarker(robot.marker_size_m, robot.marker_height_m, 0, yaw=yaw)
     done = track(
-        *(source, above, (marker.target(source),), tmp_path / "kept", Reporter(quiet=True))
+        *(
+            source,
+            above,
+            (marker.target(source, Reporter(quiet=True)),),
+            tmp_path / "kept",
+            Reporter(quiet=True),
+        )
     ).tracks[0]
     off = done.pose - np.array([path(t) for t in frames])
     off[:, 2] = np.angle(np.exp(1j * off[:, 2]))

@@ -7,6 +7,7 @@ import pytest
 
 from slipid.camera.calibration.calibrate import lens_from_pictures
 from slipid.camera.floor.result import PictureMap
+from slipid.support.progress import Reporter
 from tests.helpers import made_boards
 from tests.helpers.calibrated import ABOVE, BOARD, TRUE, WORDS
 from tests.helpers.made_floors import POINTS, MadeFloor, made_floor
@@ -31,7 +32,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def calibrated(folder):
     """Return the lens calibrated by the pictures of the board."""
-    return lens_from_pictures([str(folder / "lens")], BOARD, False)
+    return lens_from_pictures([str(folder / "lens")], BOARD, False, Reporter(quiet=True))
 
 
 @pytest.fixture(scope="module")

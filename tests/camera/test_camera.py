@@ -7,8 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from slipid.camera.opencv import marker_dictionary, read_picture
+from slipid.camera.opencv import marker_dictionary
 from slipid.camera.overhead import OverheadCamera, read_camera
+from slipid.camera.picture_file import read_picture
 from slipid.support.errors import DataError
 from tests.helpers.made_videos import Stage, lens_of
 

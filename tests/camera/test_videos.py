@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.camera import opencv
+from slipid.camera import video
 from slipid.camera.frame import cut_off
 from slipid.camera.frame_source import open_source
 from slipid.camera.video import MARGIN, Video, VideoStream, still
@@ -14,7 +14,7 @@ from tests.helpers.made_sources import encoded, write_video
 from tests.helpers.track_command import LONE, ROBOT, STAGE, Made, track
 
 COUNT = 40
-SHARP = {"crf": "8"}
+SHARP, LOSSLESS = {"crf": "8"}, {"qp": "0"}
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +52,9 @@ def test_every_codec_gives_the_pixels_that_were_encoded(pictures, tmp_path, name
 
 @pytest.mark.parametrize("rotation", [90, 180, 270])
 def test_an_orientation_flag_is_reported_and_changes_no_pose(made, pictures, rotation):
-    plain = encoded(made.folder / "plain.mp4", pictures[:8], options=SHARP)
+    plain = encoded(made.folder / "plain.mp4", pictures[:8], options=LOSSLESS)
     flagged = encoded(
-        made.folder / f"r{rotation}.mp4", pictures[:8], options=SHARP, rotation=rotation
+        made.folder / f"r{rotation}.mp4", pictures[:8], options=LOSSLESS, rotation=rotation
     )
     poses = [made.folder / f"{path.stem}.csv" for path in (plain, flagged)]
     first = track(made, plain, poses[0], *LONE)
@@ -148,9 +148,9 @@ def test_frames_of_several_sizes_are_refused(pictures, tmp_path, monkeypatch):
 def test_huge_frames_and_other_files_are_refused_before_decoding(pictures, tmp_path, monkeypatch):
     path = write_video(tmp_path / "a.avi", pictures[:2])
     with monkeypatch.context() as patch:
-        patch.setattr(opencv, "MOST_PIXELS", 480 * 270 - 1)
+        patch.setattr(video, "MOST_PIXELS", 480 * 270 - 1)
         patch.setattr(VideoStream, "frames", None)
-        with pytest.raises(DataError, match=r"a\.avi: 480 x 270 pixels; expected"):
+        with pytest.raises(DataError, match=r"a\.avi: frames of 480 x 270 pixels; expected"):
             open_source(str(path))
     sound = tmp_path / "sound.wav"
     sound.write_bytes(b"RIFF\x24\x01\x00\x00WAVEfmt \x10\0\0\0\x01\0\x01\0\x40\x1f\0\0\x80\x3e\0\0"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from slipid.camera.calibration.board import Board, Picture, View, check_enough
+from slipid.camera.calibration.board import Board, Picture, View
 from slipid.camera.calibration.lens import fit_robustly
 from slipid.camera.calibration.points import FloorPoints
 from slipid.camera.calibration.quality import quality_of
+from slipid.camera.calibration.views import check_enough
 from slipid.camera.overhead import Lens
 from tests.helpers import made_boards as made
 

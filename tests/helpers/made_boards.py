@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -166,4 +167,18 @@ def write(image: np.ndarray, path: Path) -> Path:
     """Write a picture as a PNG file, and return its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    return path
+
+
+def exif(orientation: int, order: str = "<") -> bytes:
+    """Return EXIF data with an orientation flag, in little or big endian."""
+    start = b"II*\0" if order == "<" else b"MM\0*"
+    return start + struct.pack(order + "IHHHIHHI", 8, 1, 0x112, 3, 1, orientation, 0, 0)
+
+
+def write_flagged(jpeg: bytes, orientation: int, path: Path) -> Path:
+    """Write a JPEG with an EXIF orientation flag, and return its path."""
+    block = b"Exif\0\0" + exif(orientation, "<" if orientation % 2 else ">")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + jpeg[2:])
     return path

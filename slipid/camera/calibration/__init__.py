@@ -1,4 +1,4 @@
-"""Camera calibration from images of a ChArUco board: the lens, and its pose above the floor.
+"""Camera calibration from images of a board: the lens, and its pose above the floor.
 
 Heights matter. A point h above the floor, seen by a lens at a height H, appears H / (H - h) times
 as far from the point below the lens as it really is. With H = 2.4 m and a marker at a height of

@@ -1,23 +1,16 @@
-"""A printed ChArUco board, its corners in images, and the selection of usable views."""
+"""Printed boards, with markers or without, and their corners in images."""
 
-import glob
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.opencv import (
-    cv2,
-    marker_count,
-    marker_dictionary,
-    pictures_in,
-    size_of,
-    visible_markers,
-)
+from slipid.camera.frame import grey_of
+from slipid.camera.opencv import Grey, cv2, marker_count, marker_dictionary, size_of
+from slipid.camera.search import small
 from slipid.support.errors import DataError
 
 LARGEST_M = 1.0
@@ -25,17 +18,11 @@ LARGEST_M = 1.0
 LEAST_CORNERS = 6
 """Smallest number of corners in a usable view. A pose has six unknowns and each corner gives two
 equations, so three corners would leave no equation for the lens."""
-SEARCHED_PICTURES = 3
-"""Number of images that are searched for other boards if the given board is not detected; few,
-because every dictionary is tried on each image."""
-ENOUGH_DETECTIONS = 4
-"""Smallest number of detected markers or corners with which a board counts as present; so many
-false detections at once are unlikely."""
-LEAST_VIEWS = 6
-"""Smallest number of usable views; as many must also differ from each other."""
-SAME_VIEW = 0.08
-"""Distance between common corners, relative to the board's size in the image, up to which two views
-count as the same [1], see `_difference`."""
+REFINED_SHARE = 0.4
+"""Half the width of the window in which a corner of a plain chessboard is refined, relative to the
+smallest distance between neighbouring corners [1]; a wider one would contain other corners."""
+Corners = tuple[Float[np.ndarray, "corner 2"], Float[np.ndarray, "corner 2"]]
+"""Pixels of detected corners, and their positions in the board's axes [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,87 +38,34 @@ class Picture:
         return size_of(self.image)
 
 
-def named_pictures(words: Sequence[str]) -> list[Path]:
-    """Return the image files given by command-line words, each once, in the words' order.
-
-    Args:
-        words: files, folders and glob patterns.
-
-    Raises:
-        DataError: a folder contains no image, or no file matches a pattern.
-    """
-    named: dict[Path, None] = {}
-    for word in words:
-        path = Path(word)
-        if path.is_dir():
-            files = pictures_in(path)
-        elif path.exists() or not glob.has_magic(word):
-            files = [path]
-        else:
-            files = sorted(Path(p) for p in glob.glob(word, recursive=True) if Path(p).is_file())
-            if not files:
-                raise DataError(f"{word}: no file matches this pattern; expected image files")
-        named.update(dict.fromkeys(files))
-    return list(named)
-
-
 @dataclass(frozen=True)
-class Board:
-    """A chessboard with markers in its white squares, printed flat.
+class PrintedBoard(ABC):
+    """A chessboard that is printed flat.
 
     The board's axes start at the upper left corner of its first square: x right, y down.
 
     Attributes:
         columns, rows: number of squares along x and along y.
-        square_m, marker_m: edge length of a square and of a marker [m].
-        dictionary: dictionary of its markers, such as `4X4_50`.
-        legacy: True if the board was drawn by OpenCV before 4.6, which began boards with an even
-            number of rows with a white square.
+        square_m: edge length of a square [m].
     """
 
     columns: int
     rows: int
     square_m: float
-    marker_m: float
-    dictionary: str = "4X4_50"
-    legacy: bool = False
 
-    def __post_init__(self) -> None:
-        marker_dictionary(self.dictionary)
+    def check_squares(self) -> None:
+        """Raise `DataError` if there are too few squares, or if they are too large."""
         if not (self.columns >= 3 and self.rows >= 3):
             raise DataError(f"a board of {self.size} squares; expected 3x3 or more, such as 7x5")
-        if not 0 < self.marker_m < self.square_m <= LARGEST_M:
+        if not 0 < self.square_m <= LARGEST_M:
             raise DataError(
-                f"squares of {self.square_m:g} m and markers of {self.marker_m:g} m; expected "
-                f"markers smaller than squares, both in metres and of {LARGEST_M:g} m at most"
-            )
-        available, needed = marker_count(self.dictionary), self.columns * self.rows // 2
-        if needed > available:
-            raise DataError(
-                f"a board of {self.size} squares has {needed} markers, but dictionary "
-                f"{self.dictionary} has {available}; expected a larger dictionary, such as 4X4_250"
+                f"squares of {self.square_m:g} m; expected metres, and {LARGEST_M:g} m at most"
             )
 
     @property
     def size(self) -> str:
         """Columns and rows as a user writes them, such as `7x5`."""
         return f"{self.columns}x{self.rows}"
-
-    def __str__(self) -> str:
-        old = ", legacy pattern" if self.legacy else ""
-        return (
-            f"{self.size} squares of {self.square_m:g} m, markers of {self.marker_m:g} m from "
-            f"{self.dictionary}{old}"
-        )
-
-    @cached_property
-    def pattern(self) -> object:
-        """The board as an object of OpenCV."""
-        size, dictionary = (self.columns, self.rows), marker_dictionary(self.dictionary)
-        board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
-        if self.legacy:
-            board.setLegacyPattern(True)
-        return board
 
     @cached_property
     def corners_m(self) -> Float[np.ndarray, "corner 2"]:
@@ -155,6 +89,101 @@ class Board:
         x, y = ((board_m - middle) * [1, -1]).T
         return np.stack([x, y, np.full(len(x), height_m)], 1)
 
+    @abstractmethod
+    def detected(self, grey: Grey) -> Corners:
+        """Return the corners in an image; no corners if the board is not detected."""
+
+
+@dataclass(frozen=True)
+class Board(PrintedBoard):
+    """A ChArUco board: a chessboard with markers in its white squares.
+
+    Attributes:
+        marker_m: edge length of a marker [m].
+        dictionary: dictionary of its markers, such as `4X4_50`.
+        legacy: True if the board was drawn by OpenCV before 4.6, which began boards with an even
+            number of rows with a white square.
+    """
+
+    marker_m: float
+    dictionary: str = "4X4_50"
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        marker_dictionary(self.dictionary)
+        self.check_squares()
+        if not 0 < self.marker_m < self.square_m:
+            raise DataError(
+                f"squares of {self.square_m:g} m and markers of {self.marker_m:g} m; expected "
+                "markers smaller than squares, both in metres"
+            )
+        available, needed = marker_count(self.dictionary), self.columns * self.rows // 2
+        if needed > available:
+            raise DataError(
+                f"a board of {self.size} squares has {needed} markers, but dictionary "
+                f"{self.dictionary} has {available}; expected a larger dictionary, such as 4X4_250"
+            )
+
+    def __str__(self) -> str:
+        old = ", legacy pattern" if self.legacy else ""
+        return (
+            f"{self.size} squares of {self.square_m:g} m, markers of {self.marker_m:g} m from "
+            f"{self.dictionary}{old}"
+        )
+
+    @cached_property
+    def pattern(self) -> object:
+        """The board as an object of OpenCV."""
+        size, dictionary = (self.columns, self.rows), marker_dictionary(self.dictionary)
+        board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
+        if self.legacy:
+            board.setLegacyPattern(True)
+        return board
+
+    def detected(self, grey: Grey) -> Corners:
+        """Return the corners in an image; no corners if the board is not detected."""
+        pixels, numbers = cv2.aruco.CharucoDetector(self.pattern).detectBoard(grey)[:2]
+        if numbers is None:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        return np.asarray(pixels, float).reshape(-1, 2), self.corners_m[np.ravel(numbers)]
+
+
+@dataclass(frozen=True)
+class Chessboard(PrintedBoard):
+    """A chessboard without markers, detected only where all its inner corners are in view.
+
+    Nothing tells a board from the same board turned by half a turn, so its corners determine a lens
+    but not the axes of a floor.
+    """
+
+    def __post_init__(self) -> None:
+        self.check_squares()
+
+    @property
+    def inner(self) -> str:
+        """Number of inner corners along x and y as a user writes them, such as `9x6`."""
+        return f"{self.columns - 1}x{self.rows - 1}"
+
+    def __str__(self) -> str:
+        return f"a chessboard with {self.inner} inner corners, squares of {self.square_m:g} m"
+
+    def detected(self, grey: Grey) -> Corners:
+        """Return the corners in an image; no corners if the board is not detected."""
+        copy = small(grey)
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        shape = (self.columns - 1, self.rows - 1)
+        found, rough = cv2.findChessboardCornersSB(copy, shape, flags=flags)
+        if not found:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        scale = np.array(size_of(grey)) / size_of(copy)
+        pixels = ((np.asarray(rough, float).reshape(-1, 2) + 0.5) * scale - 0.5).astype(np.float32)
+        grid = pixels.reshape(*shape[::-1], 2)
+        steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
+        reach = max(2, int(REFINED_SHARE * min(steps)))
+        until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
+        fine = cv2.cornerSubPix(grey, pixels.reshape(-1, 1, 2), (reach, reach), (-1, -1), until)
+        return np.asarray(fine, float).reshape(-1, 2), self.corners_m
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -164,15 +193,17 @@ class View:
         name: name of the image.
         pixels: x and y of the corners in the image [pixel].
         board_m: x and y of the same corners in the board's axes [m].
+        inverted: True if the board is printed white on black.
     """
 
     name: str
     pixels: Float[np.ndarray, "corner 2"]
     board_m: Float[np.ndarray, "corner 2"]
+    inverted: bool = False
 
     def only(self, kept: np.ndarray) -> "View":
         """Return the view with only the corners that a mask or indices select."""
-        return View(self.name, self.pixels[kept], self.board_m[kept])
+        return replace(self, pixels=self.pixels[kept], board_m=self.board_m[kept])
 
     @property
     def flat(self) -> bool:
@@ -191,135 +222,35 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
     Raises:
         DataError: the string does not have this form, or no board can have these sizes.
     """
-    columns, by, rows = size.lower().partition("x")
-    if not (by and columns.strip().isdecimal() and rows.strip().isdecimal()):
-        raise DataError(f"--board {size}; expected the numbers of squares along x and y, as in 7x5")
-    return Board(int(columns), int(rows), square_m, marker_m, dictionary, legacy)
+    columns, rows = _numbers("--board", size, "squares along x and y, as in 7x5")
+    return Board(columns, rows, square_m, marker_m, dictionary, legacy)
 
 
-def view_of(board: Board, picture: Picture) -> View:
-    """Return the corners of the board in an image; an empty view if the board is not detected."""
-    detector = cv2.aruco.CharucoDetector(board.pattern)
-    pixels, numbers = detector.detectBoard(picture.image)[:2]
-    if numbers is None:
-        return View(picture.path.name, np.zeros((0, 2)), np.zeros((0, 2)))
-    pixels = np.asarray(pixels, float).reshape(-1, 2)
-    return View(picture.path.name, pixels, board.corners_m[np.ravel(numbers)])
-
-
-def usable(board: Board, pictures: Sequence[Picture]) -> tuple[list[View], list[str]]:
-    """Return the usable views of a board in images of one size, and sentences on unusable views.
+def chessboard_of(inner: str, square_m: float) -> Chessboard:
+    """Return a board whose inner corners are given as a string such as `9x6`: columns x rows.
 
     Raises:
-        DataError: the images differ in size, or the board is detected in too few of them.
+        DataError: the string does not have this form, or no board can have these sizes.
     """
-    for other in pictures[1:]:
-        if other.image_px != pictures[0].image_px:
-            (w, h), (width, height) = pictures[0].image_px, other.image_px
-            raise DataError(
-                f"{other.path}: {width} x {height} pixels, but {pictures[0].path} has {w} x {h}; "
-                "expected images of one camera at one resolution"
-            )
-    views = [view_of(board, picture) for picture in pictures]
-    if not any(len(view.pixels) for view in views):
-        raise not_detected(board, pictures)
-    left_out = [
-        f"view {v.name} left out: {len(v.pixels)} corners"
-        + (" near one line" if len(v.pixels) >= LEAST_CORNERS else "")
-        + f"; expected {LEAST_CORNERS} corners or more, not all on a line"
-        for v in views
-        if v.flat
-    ]
-    good = [v for v in views if not v.flat]
-    check_enough(good)
-    return good, left_out
+    columns, rows = _numbers("--chessboard", inner, "inner corners along x and y, as in 9x6")
+    return Chessboard(columns + 1, rows + 1, square_m)
 
 
-def check_enough(views: Sequence[View]) -> None:
-    """Check that there are enough views, and enough that differ from each other.
+def _numbers(option: str, text: str, what: str) -> tuple[int, int]:
+    """Return the two numbers in a text such as `7x5`, each of three digits at most."""
+    columns, by, rows = (part.strip() for part in text.lower().partition("x"))
+    if not (by and columns.isdecimal() and rows.isdecimal() and max(len(columns), len(rows)) < 4):
+        raise DataError(f"{option} {text}; expected the numbers of {what}")
+    return int(columns), int(rows)
 
-    Raises:
-        DataError: there are too few views, or too few that differ from each other.
+
+def view_of(board: PrintedBoard, picture: Picture) -> View:
+    """Return the corners of a board in an image; an empty view if the board is not detected.
+
+    If it is not detected, a board printed white on black is looked for.
     """
-    if len(views) < LEAST_VIEWS:
-        raise DataError(
-            f"{len(views)} usable views of the board; expected {LEAST_VIEWS} at the very least, "
-            "better 15: take more images, at every edge and corner of the image and tilted"
-        )
-    distinct: list[View] = []
-    for view in views:
-        if all(_difference(view, other) > SAME_VIEW for other in distinct):
-            distinct.append(view)
-    if len(distinct) < LEAST_VIEWS:
-        raise DataError(
-            f"only {len(distinct)} of {len(views)} views differ: the others show the board where "
-            f"another view shows it; expected {LEAST_VIEWS} or more views that differ: move the "
-            "board over the whole image and tilt it"
-        )
-
-
-def _difference(view: View, other: View) -> float:
-    """Return how far common corners of two views lie apart, relative to the corners' spread [1].
-
-    Distance and spread are root mean squares over the common corners [pixel]; the spread is about
-    the corners' middle. The difference is infinite if the views have too few common corners.
-    """
-    first, second = (np.round(v.board_m, 6) @ [1, 1j] for v in (view, other))
-    common, in_view, in_other = np.intersect1d(first, second, return_indices=True)
-    if len(common) < LEAST_CORNERS:
-        return np.inf
-    here, there = view.pixels[in_view], other.pixels[in_other]
-    return float(np.linalg.norm(here - there) / np.linalg.norm(here - here.mean(0)))
-
-
-def not_detected(board: Board, pictures: Sequence[Picture]) -> DataError:
-    """Return the error to raise if no image shows the board, with advice by `_advice`."""
-    if len(pictures) == 1:
-        where = f"{pictures[0].path}: the board is not found in it"
-    else:
-        where = f"{pictures[0].path} and {len(pictures) - 1} more: the board is in none of them"
-    return DataError(f"{where}; looked for {board}; {_advice(board, pictures[:SEARCHED_PICTURES])}")
-
-
-def _advice(board: Board, pictures: Sequence[Picture]) -> str:
-    """Return a sentence on the markers that images show instead of the board, with a remedy."""
-    if other := _other_board(board, board.dictionary, pictures):
-        return other
-    name, numbers = visible_markers([picture.image for picture in pictures])
-    if other := _other_board(board, name, pictures):
-        return other
-    if len(numbers) < ENOUGH_DETECTIONS:
-        return (
-            "and found no markers of any dictionary: expected a board that is sharp, evenly lit, "
-            "not mirrored, and so large that a marker is 20 pixels wide or more"
-        )
-    remedy = f"use --dictionary {name} and the board's true size"
-    if name == board.dictionary:
-        remedy = (
-            f"expected another --board size, or a board whose markers are numbered from 0 to "
-            f"{board.columns * board.rows // 2 - 1}"
-        )
-    return (
-        f"but found {len(numbers)} markers of {name} with numbers from {numbers[0]} to "
-        f"{numbers[-1]}: {remedy}"
-    )
-
-
-def _other_board(board: Board, dictionary: str, pictures: Sequence[Picture]) -> str | None:
-    """Return advice if images show a similar board with this dictionary's markers, else None.
-
-    A similar board may have rows and columns swapped, the other value of `legacy`, or both.
-    """
-    if marker_count(dictionary) < board.columns * board.rows // 2:
-        return None
-    swapped = replace(board, columns=board.rows, rows=board.columns)
-    for size, legacy in product((board, swapped), (board.legacy, not board.legacy)):
-        other = replace(size, legacy=legacy, dictionary=dictionary)
-        corners = max(len(view_of(other, picture).pixels) for picture in pictures)
-        if corners >= ENOUGH_DETECTIONS:
-            option = "--legacy" if legacy else "without --legacy"
-            return (
-                f"but found {corners} corners of a board of {other}; use --board {other.size} "
-                f"--dictionary {dictionary} {option}"
-            )
-    return None
+    grey = grey_of(picture.image)
+    view = View(picture.path.name, *board.detected(grey))
+    if len(view.pixels) or not isinstance(board, Board):
+        return view
+    return View(picture.path.name, *board.detected(255 - grey), inverted=True)

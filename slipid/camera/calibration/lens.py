@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.calibration.board import View, check_enough
+from slipid.camera.calibration.board import View
+from slipid.camera.calibration.views import check_enough
 from slipid.camera.opencv import cv2
 from slipid.camera.overhead import Lens
 from slipid.support.errors import DataError

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from slipid.camera.calibration.board import View
 from slipid.camera.calibration.lens import (
@@ -61,6 +61,40 @@ class Coverage:
     def share(self) -> float:
         """Fraction of the image's cells that contain corners [1]."""
         return float(self.visited.mean())
+
+    def empty_cells(self) -> str:
+        """Return the cells without corners as text, such as `row 1: 1-3, 8; row 6: 1-8`."""
+        rows = [
+            f"row {down}: {_ranges(np.flatnonzero(~visited) + 1)}"
+            for down, visited in enumerate(self.visited, 1)
+            if not visited.all()
+        ]
+        return "; ".join(rows)
+
+
+def _ranges(numbers: Int[np.ndarray, " number"]) -> str:
+    """Return increasing numbers as text with ranges, such as `1-3, 8`."""
+    groups = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    return ", ".join(f"{g[0]}-{g[-1]}" if len(g) > 1 else f"{g[0]}" for g in groups)
+
+
+class TooLittleCovered(DataError):
+    """Error about views that leave too much of the image without corners.
+
+    Attributes:
+        fit: the lens as these views give it.
+        coverage: coverage of the image.
+    """
+
+    def __init__(self, fit: LensFit, coverage: Coverage):
+        self.fit, self.coverage = fit, coverage
+        down, across = coverage.visited.shape
+        super().__init__(
+            f"corners in {100 * coverage.share:.0f} % of the image's {across} x {down} cells; "
+            f"expected {100 * POOR_SHARE:.0f} % or more, since distortion is unknown where no "
+            f"corner was: move the board into the empty cells ({coverage.empty_cells()}, counted "
+            "from the upper left)"
+        )
 
 
 def coverage(pixels: Float[np.ndarray, "corner 2"], image_px: tuple[int, int]) -> Coverage:
@@ -122,11 +156,7 @@ def check_usable(fit: LensFit, covered: Coverage, tilts: Float[np.ndarray, " vie
     if focal > REFUSED_FOCAL:
         raise indeterminate(f"the focal length is known only to {100 * focal:.1f} %")
     if covered.share < REFUSED_SHARE:
-        raise DataError(
-            f"corners in {100 * covered.share:.0f} % of the image's {covered.visited.size} "
-            f"cells; expected {100 * POOR_SHARE:.0f} % or more, since distortion is unknown where "
-            "no corner was: move the board to every edge and corner of the image"
-        )
+        raise TooLittleCovered(fit, covered)
 
 
 def held_out_px(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> float:
@@ -159,7 +189,8 @@ def _poor(fit: LensFit, covered: Coverage, held_out: float) -> list[str]:
     if covered.share < POOR_SHARE:
         poor.append(
             f"corners in {100 * covered.share:.0f} % of the image; expected "
-            f"{100 * POOR_SHARE:.0f} % or more: take images with the board in the empty cells"
+            f"{100 * POOR_SHARE:.0f} % or more: take images with the board in the empty cells "
+            f"({covered.empty_cells()}, counted from the upper left)"
         )
     if covered.reach < POOR_REACH:
         poor.append(

@@ -139,6 +139,7 @@ def report_lines(report: Content, lens_too: bool = True) -> list[str]:
     lens, floor, poor = report.get("lens"), report.get("floor"), report.get("poor", [])
     lines = list(_lens(lens)) if lens and lens_too else []
     lines += _floor(floor) if floor else []
+    lines += [f"note: {sentence}" for sentence in report.get("notes", [])]
     lines += [f"POOR: {sentence}" for sentence in poor]
     if not poor and (lens or (floor and "points" in floor)):
         lines.append("verdict: good")

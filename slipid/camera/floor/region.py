@@ -32,6 +32,7 @@ from slipid.camera.floor.light import Features, features_of, lab_of, linear_of_c
 from slipid.camera.floor.surfaces import Seeds, surroundings
 from slipid.camera.opencv import Mask, size_of
 from slipid.camera.overhead import OverheadCamera
+from slipid.camera.search import MIRRORED, mirror_image
 from slipid.data.floor_map import Colour, Point
 from slipid.support.errors import DataError
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
@@ -223,7 +224,8 @@ def requested_region(source: FloorPicture, robot: RobotShape, cell: float | None
         cell: edge length of a cell [m]; None for the edge length of a pixel on the floor.
 
     Raises:
-        DataError: the image's resolution is not the camera's, or the region has no visible floor.
+        DataError: the image's resolution is not the camera's, the image is mirrored, or the region
+            has no visible floor.
     """
     picture, camera, palette = source.picture, source.camera, source.palette
     camera.lens.check_size(size_of(picture), source.path)
@@ -242,6 +244,8 @@ def requested_region(source: FloorPicture, robot: RobotShape, cell: float | None
     for polygon in palette.mask:
         visible &= ~source.cells(floor, polygon)
     robots = detected_robots(picture, camera, robot)
+    if not robots and detected_robots(mirror_image(picture), camera, robot):
+        raise DataError(f"{source.path}: a robot's marker {MIRRORED}")
     for one in robots:
         visible &= ~floor.of_picture(hidden_by(one, robot, camera))
     if visible.sum() < LEAST_CELLS:

@@ -12,7 +12,8 @@ from slipid.camera.floor.light import code_of_linear
 from slipid.camera.floor.outline import PatchOutline, outlines_of, signed_area
 from slipid.camera.floor.region import FloorRegion
 from slipid.camera.floor.surfaces import UNKNOWN, Costs, Surfaces
-from slipid.camera.opencv import Labels, is_picture
+from slipid.camera.opencv import Labels
+from slipid.camera.picture_file import is_picture
 from slipid.data.geojson_map import MapRegion, Patch, VectorMap
 from slipid.support.content import Content
 from slipid.support.errors import DataError

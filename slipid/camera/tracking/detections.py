@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.camera.frame import FrameSource, read_ahead
-from slipid.camera.opencv import Grey, visible_markers
+from slipid.camera.opencv import Grey
+from slipid.camera.search import MIRRORED, mirror_image, visible_markers
 from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region, cut
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
@@ -96,7 +97,8 @@ def detect_all(
                     log["time"].append(frame.time)
                     log["repeated"].append(repeated)
                     if len(log["frame"]) == FIRST_FRAMES and not log["row"]:
-                        report.line(_others(frame.grey, tracker) or "no marker detected so far")
+                        report.line(_others(source, frame.grey, tracker, report))
+                        report.stage("tracking")
                 before = frame.grey
                 if clock.monotonic() > saved + CHECKPOINT_S:
                     checkpoint.save(CHECKPOINT_NAME, vars(Detections.of(log)))
@@ -105,45 +107,81 @@ def detect_all(
         except KeyboardInterrupt:
             checkpoint.save(CHECKPOINT_NAME, vars(Detections.of(log)))
             raise
-    if not log["row"]:
-        if before is not None and (sentence := _others(before, tracker)):
-            raise DataError(f"{source.name}: {sentence}")
-        wanted = ", ".join(map(str, sorted(tracker.ids)))
+    if len(log["frame"]) > 1 and all(log["repeated"][1:]):
         raise DataError(
-            f"{source.name}: marker {wanted} in none of {len(log['frame'])} frames; expected the "
-            "marker in view, sharp, flat, with a white margin around it"
+            f"{source.name}: all {len(log['frame'])} frames are identical; expected a recording "
+            "whose frames differ at least by noise: the camera or the recording has stopped"
         )
+    if not log["row"]:
+        last = _not_uniform(source, before)
+        raise DataError(f"{source.name}: {_others(source, last, tracker, report)}")
     return Detections.of(log)
 
 
-def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
-    """Return advice if an image shows markers but no tracked marker; None otherwise."""
+def _others(source: FrameSource, grey: Grey, tracker: MarkerTracker, report: Reporter) -> str:
+    """Return advice if no frame so far, the last of which is given, shows any tracked marker.
+
+    Raises:
+        DataError: the frame shows a tracked marker mirrored.
+    """
     wanted = ", ".join(map(str, sorted(tracker.ids)))
+    part = cut(grey, tracker.region)
+    _refuse_mirrored(source, part, tracker.detector, tracker.ids)
     visible = {d.id for d in tracker.detector.detect(grey, tracker.region)}
     if others := sorted(visible - tracker.ids):
         return (
             f"marker {wanted} is in no frame so far, but {_numbers(others)} in view; expected "
             f"--id {others[0]}, or a file of targets"
         )
-    dictionary, numbers = visible_markers([cut(grey, tracker.region)])
-    if not numbers:
-        return None
-    return (
-        f"marker {wanted} is in no frame so far, but {_numbers(numbers)} of the dictionary "
-        f"{dictionary} in view; expected --dictionary {dictionary}"
-    )
+    found = f"marker {wanted} is in no frame so far"
+    report.stage("searching for markers of any dictionary")
+    visible_now = visible_markers([part], report.steps)
+    if not visible_now.numbers:
+        return f"{found}; expected it in view, sharp, flat, with a white margin around it"
+    where = f"{_numbers(visible_now.numbers)} of the dictionary {visible_now.dictionary}"
+    if visible_now.mirrored:
+        return f"{found}, but {where} {MIRRORED}"
+    return f"{found}, but {where} in view; expected --dictionary {visible_now.dictionary}"
+
+
+def _not_uniform(source: FrameSource, grey: Grey | None) -> Grey:
+    """Return the last frame that was searched; raise `DataError` if all its pixels are equal."""
+    if grey is None:
+        raise DataError(f"{source.name}: no frame; expected a video with frames")
+    if not np.ptp(grey):
+        raise DataError(
+            f"{source.name}: no marker, and every pixel of the last searched frame is "
+            f"{grey.flat[0]}; expected frames that show the floor: is the lens covered, or the "
+            "video empty?"
+        )
+    return grey
+
+
+def _refuse_mirrored(
+    source: FrameSource, part: Grey, detector: MarkerDetector, ids: frozenset[int] | None
+) -> None:
+    """Raise `DataError` if markers with these numbers can be read only mirrored.
+
+    `part` is the searched part of a frame without these markers; `ids` is None for any number.
+    """
+    mirrored = {d.id for d in detector.detect(mirror_image(part))}
+    if mirrored and (ids is None or mirrored & ids):
+        raise DataError(f"{source.name}: {_numbers(sorted(mirrored))} {MIRRORED}")
 
 
 def _numbers(ids: Sequence[int]) -> str:
     return f"marker{'s' if len(ids) > 1 else ''} {', '.join(map(str, ids))}"
 
 
-def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | None = None) -> int:
+def only_marker(
+    source: FrameSource, detector: MarkerDetector, region: Region | None, report: Reporter
+) -> int:
     """Return the number of the only marker in the first frames of a video, or in a region of them.
 
     Raises:
         DataError: these frames show no marker of the dictionary, or several.
     """
+    report.stage("searching for the marker")
     counts: Counter[int] = Counter()
     last: Grey | None = None
     with closing(read_ahead(source.frames())) as frames:
@@ -160,11 +198,17 @@ def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | 
             f"{source.name}: {_numbers(often)} in view; expected --id with the number of the "
             "robot's marker, or a file of targets"
         )
-    dictionary, numbers = visible_markers([] if last is None else [cut(last, region)])
-    if numbers:
+    part = cut(_not_uniform(source, last), region)
+    _refuse_mirrored(source, part, detector, None)
+    report.stage("searching for markers of any dictionary")
+    visible = visible_markers([part], report.steps)
+    if visible.numbers:
+        end = (
+            MIRRORED if visible.mirrored else f"in view; expected --dictionary {visible.dictionary}"
+        )
         raise DataError(
-            f"{source.name}: no marker of the requested dictionary, but {_numbers(numbers)} of "
-            f"{dictionary} in view; expected --dictionary {dictionary}"
+            f"{source.name}: no marker of the requested dictionary, but "
+            f"{_numbers(visible.numbers)} of {visible.dictionary} {end}"
         )
     raise DataError(
         f"{source.name}: no marker of any dictionary in the first frames; expected a marker in "

@@ -189,7 +189,7 @@ class LoneMarker:
         if self.id is not None and self.id > most:
             raise DataError(f"--id {self.id}; expected 0 to {most} in {self.dictionary}")
 
-    def target(self, source: FrameSource, region: Region | None = None) -> Target:
+    def target(self, source: FrameSource, report: Reporter, region: Region | None = None) -> Target:
         """Return the body with its marker.
 
         If the marker has no number, the first frames, or a region of them, are searched for it.
@@ -199,7 +199,7 @@ class LoneMarker:
         """
         number = self.id
         if number is None:
-            number = only_marker(source, MarkerDetector(self.dictionary), region)
+            number = only_marker(source, MarkerDetector(self.dictionary), region, report)
         marker = Marker.at(number, self.size, self.height, yaw=self.yaw)
         return Target("robot", self.dictionary, (marker,))
 

@@ -126,7 +126,7 @@ FLAT = [
                      for k in range(12)]), "tilted|focal length"),
         (projected_views(FLAT), "tilted|focal length"),
         (projected_views([made.held(30 * np.cos(k), 30 * np.sin(k), 17.0 * k, (0.0, 0.0, 0.9))
-                     for k in range(12)], 0.02), "corners in .* % of the image's 48 cells"),
+                     for k in range(12)], 0.02), "corners in .* % of the image's 8 x 6 cells"),
     ],
     ids=["few", "same", "parallel", "parallel everywhere", "in the middle alone"],
 )  # fmt: skip
@@ -146,7 +146,7 @@ def test_each_reason_to_refuse_a_lens_is_one():
     vague = replace(fit, covariance=spread_out)
     with pytest.raises(DataError, match=r"the focal length is known only to 2\.5 %"):
         check_usable(vague, whole, tilts)
-    with pytest.raises(DataError, match=r"corners in 2 % of the image's 48 cells"):
+    with pytest.raises(DataError, match=r"corners in 2 % of the image's 8 x 6 cells"):
         check_usable(fit, coverage(np.full((9, 2), 200.0), SIZE), tilts)
 
 

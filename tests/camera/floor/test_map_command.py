@@ -1,6 +1,7 @@
 """`slipid map`: its files, its exit codes, and one message for each bad input."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -160,6 +161,12 @@ def test_a_poor_map_is_written_and_ends_with_1(tmp_path):
     assert code == 1, text
     assert "cannot be distinguished" in text
     assert (out / "map.geojson").is_file()
+
+
+def test_a_mirrored_picture_is_refused_as_such(made, tmp_path):
+    mirrored = replace(made, picture=np.ascontiguousarray(made.picture[:, ::-1]))
+    with pytest.raises(DataError, match=r"floor\.png: a robot's marker can be read only mirrored"):
+        mapped(mirrored, tmp_path, REGION)
 
 
 def test_the_command_needs_a_camera_of_these_pictures(tmp_path):

@@ -103,7 +103,7 @@ def test_a_freeze_is_noticed_across_an_interrupt(made, tmp_path, monkeypatch):
 
 def test_poses_that_cannot_be_written_are_kept(made, tmp_path, monkeypatch):
     source = open_source(str(made.video("robot", ROBOT)))
-    target = tracking.LoneMarker(0.131, 0.25, 0).target(source)
+    target = tracking.LoneMarker(0.131, 0.25, 0).target(source, KeptMessages())
     monkeypatch.setattr(detections, "CHECKPOINT_S", 0.0)
     done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", KeptMessages())
     (tmp_path / "file").write_text("", encoding="utf-8")
@@ -120,7 +120,7 @@ def test_a_marker_that_comes_late_is_detected_among_others(tmp_path):
     still = STAGE.film([OTHER], 1)
     video = write_video(tmp_path / "a.avi", [*still * 104, *STAGE.film([OTHER, late], 110)[104:]])
     source, messages = open_source(str(video)), KeptMessages()
-    target = tracking.LoneMarker(0.131, 0.25, 1).target(source)
+    target = tracking.LoneMarker(0.131, 0.25, 1).target(source, KeptMessages())
     done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", messages)
     assert done.tracks[0].good[106:].all()
     assert any("marker 1 is in no frame so far, but marker 7" in line for line in messages.lines)

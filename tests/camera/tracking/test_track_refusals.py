@@ -43,7 +43,7 @@ def refusal(made, source, *words, out=None) -> str:
 def test_other_markers_than_the_requested_ones(made):
     assert "no marker of any dictionary" in refusal(made, made.video("empty", count=3), *LONE)
     words = refusal(made, made.video("empty", count=3), *LONE, "--id", 4)
-    assert "marker 4 in none of 3 frames" in words
+    assert "marker 4 is in no frame so far; expected it in view" in words
     five = made.video("five", FIVE, count=3)
     assert "marker 3 of 5X5_50 in view; expected --dictionary 5X5_50" in refusal(made, five, *LONE)
     words = refusal(made, five, *LONE, "--id", 3)
@@ -51,6 +51,27 @@ def test_other_markers_than_the_requested_ones(made):
     both = made.video("two", ROBOT, OTHER, count=3)
     assert "markers 0, 7 in view; expected --id" in refusal(made, both, *LONE)
     assert "but markers 0, 7 in view; expected --id 0" in refusal(made, both, *LONE, "--id", 4)
+
+
+def test_mirrored_videos_are_refused_as_such(made):
+    frames = [np.ascontiguousarray(f[:, ::-1]) for f in STAGE.film([ROBOT], 3)]
+    mirrored = write_video(made.folder / "mirrored.avi", frames)
+    for words in ((), ("--id", 0)):
+        message = refusal(made, mirrored, *LONE, *words)
+        assert "marker 0 can be read only mirrored; expected pixels as the sensor" in message
+    message = refusal(made, mirrored, *LONE, "--dictionary", "5X5_50")
+    assert "marker 0 of 4X4_50 can be read only mirrored" in message
+
+
+def test_frozen_and_empty_videos_are_refused(made):
+    frozen = write_video(made.folder / "frozen.avi", STAGE.film([ROBOT], 1) * 5)
+    assert "all 5 frames are identical" in refusal(made, frozen, *LONE)
+    black = write_video(made.folder / "black.avi", [np.zeros((270, 480), np.uint8)] * 3)
+    assert "every pixel of the last searched frame is 0" in refusal(made, black, *LONE)
+    assert "identical" in refusal(made, black, *LONE, "--id", 0)
+    levels = [np.full((270, 480), 40 * k, np.uint8) for k in range(3)]
+    grey = write_video(made.folder / "grey.avi", levels)
+    assert "is the lens covered" in refusal(made, grey, *LONE, "--id", 0)
 
 
 def test_region_decides_between_several(made, tmp_path):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from slipid.camera.frame import grey_of
-from slipid.camera.opencv import read_picture
 from slipid.camera.overhead import OverheadCamera
+from slipid.camera.picture_file import read_picture
 from slipid.camera.tracking.detections import Detections
 from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
 from slipid.camera.tracking.pose import poses_of
