@@ -29,7 +29,7 @@ from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import fit_with_noise, slopes
 from slipid.predict.folds import folds_of, inner_folds, like_held_out, problem_of_runs
 from slipid.predict.predictive import ForceBalance, by_name, log_student
-from slipid.predict.ranking import ranking, transfer
+from slipid.predict.ranking import errors_by_floor, ranking, transfer
 from slipid.predict.score import Score, forecast, mean_error
 from slipid.predict.slip_models import slip_models
 from slipid.predict.validation import ScoredRun
@@ -262,6 +262,8 @@ def test_the_distribution_of_runs_it_has_not_seen_is_as_wide_as_it_has_to_be():
         made = driven("linear", ([1.0], [3.0]), seed, runs=480)
         _, models, problem, half = judged(made, ("linear",))
         gap, scale = models["linear"].scale(problem)
+        per_logged = models["linear"].log_density(problem) - log_student(gap, scale)
+        np.testing.assert_allclose(per_logged, 4 * np.log(SCALE))  # two moves of two coordinates
         q = np.einsum("ni,ni->n", gap, np.linalg.solve(scale, gap[..., None])[..., 0])[half == 1]
         found.append(q.mean() / gap.shape[1])
     assert np.mean(found) == pytest.approx(width_of_student(gap.shape[1]), abs=0.1)
@@ -305,6 +307,33 @@ def test_a_curve_carries_over_where_floors_share_it_and_nowhere_else(other):
     every = transfer(w, ROBOT)["all"]
     lost = every["pooled"]["rows"] / every["per_surface"]["rows"]
     assert lost < 1.05 if other == 0.1 else lost > 1.5
+
+
+def test_a_curve_for_a_floor_is_that_of_the_other_floors():
+    """Whatever the floor itself shows: two lines, and how far each is off where the other is."""
+    amps = np.tile(np.linspace(0.0, 2.0, 21), 2)
+    floor = np.repeat(["firm", "soft"], 21)
+    line = {"firm": (0.1, 0.05), "soft": (0.4, 0.0)}
+    slip = np.array([line[f][0] + line[f][1] * x for f, x in zip(floor, amps, strict=True)])
+    found = errors_by_floor(slip, amps, floor)
+    off = np.sqrt(np.mean((0.3 - 0.05 * amps) ** 2))
+    assert found["pooled"]["each"] == pytest.approx({"firm": off, "soft": off})
+    assert found["per_surface"]["rows"] == pytest.approx(0.0, abs=1e-12)
+    assert found["constant"]["each"]["soft"] == pytest.approx(0.4 - 0.15)
+    assert found["count"] == 42
+
+
+def test_rows_of_a_transfer_are_those_of_both_loads_unless_one_is_asked_for():
+    w = driven("affine_current", ([0.05, 0.1], [0.05, 0.1]), 7)
+    counts = {name: of["count"] for name, of in transfer(w, ROBOT).items()}
+    mine = np.asarray(w.load) == "as_built"
+    parts = [transfer(w.segments(np.flatnonzero(x)), ROBOT) for x in (mine, ~mine)]
+    filtered = "0 < s <= 1, I > 0.25 A only"
+    for name in ("all", filtered):
+        assert counts[name] == sum(part[name]["count"] for part in parts)
+    assert counts["as built only"] == parts[0]["all"]["count"]
+    assert counts[filtered] < counts["all"]
+    assert counts["fast wheels only"] < counts["all"] < counts["slower wheels too"]
 
 
 # folds, checkpoints, command --------------------------------------------------------------------

@@ -170,6 +170,14 @@ def test_no_bit_of_what_is_learnt_depends_on_left_out_runs(logs, judged, learnt)
         )
 
 
+def test_what_runs_of_a_floor_share_moves_with_no_number_of_another_floor(learnt):
+    space = learnt.problem.space
+    for floor, other in (("firm", "soft"), ("soft", "firm")):
+        slope = learnt.models[0].shared[floor].by_number
+        assert not slope[..., space.where(lambda e, f=other: e.surface == f)].any()
+        assert slope[..., space.where(lambda e, f=floor: e.surface == f)].any()
+
+
 def test_a_step_without_a_fold_uses_nothing_of_it(logs, learnt):
     """The errors by which a force balance is selected: its optimum is that of all runs."""
     rng = np.random.default_rng(0)

@@ -194,3 +194,9 @@ def test_a_floor_that_was_not_fitted_is_refused(name):
     fitted = ALL[name].fit(driven(mine, ALL["encoder"]), ROBOT)
     with pytest.raises(ValueError, match="no surface 'soft'; identified: firm"):
         fitted.increments(w, ROBOT)
+
+
+def test_a_robot_that_goes_sideways_turns_about_its_middle():
+    state = ALL["calibrated"].fit(windows(), ROBOT).state
+    assert [numbers[-1] for numbers in state.values()] == [0.0, 0.0]
+    assert all(numbers[:-1].all() for numbers in state.values())

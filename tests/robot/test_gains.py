@@ -34,9 +34,19 @@ from tests.helpers.unicycle import Unicycle
 SLOW, QUICK = Actuator(0.1, 0.22, PERIOD), Actuator(0.1, 0.0, PERIOD)
 
 
-def known(kind: str, actuator: Actuator | None = SLOW, process: float = 0.0) -> DeployedRobot:
-    """Return a robot of some kind whose record has its actuators."""
-    std = {f"process.{f}.{axis}": process for f in FLOORS for axis in ("along", "across", "yaw")}
+def known(
+    kind: str, actuator: Actuator | None = SLOW, process: float = 0.0, floors: tuple[str, ...] = ()
+) -> DeployedRobot:
+    """Return a robot of some kind whose record has its actuators.
+
+    Process noise is that of the given floors, of all if there are none; it is zero elsewhere.
+    """
+    noisy = floors or FLOORS
+    std = {
+        f"process.{f}.{axis}": process * (f in noisy)
+        for f in FLOORS
+        for axis in ("along", "across", "yaw")
+    }
     robot = deploy_known(build(SHAPES[kind], list(FLOORS)), std=std)
     if actuator is None:
         return robot
@@ -96,6 +106,13 @@ def test_gains_of_a_noisy_estimate_are_smaller():
     assert gains["yaw"] * jump == pytest.approx(LARGEST_JITTER * limits.yaw_rate, rel=1e-5)
     assert gains["place"] < numbers(quiet)["place"]
     assert all(loop.margin_deg > LATERAL_MARGIN_DEG for loop in found.loops.values())
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_gains_suit_the_noisiest_floor(floor):
+    loops = (DesignedGains.of(known("omni 4", QUICK, 0.2, floors)) for floors in ((floor,), ()))
+    one, every = (numbers(found.gains) for found in loops)
+    assert one == every
 
 
 def test_exports_say_margin_and_bandwidth_and_only_gains_that_are_used():
