@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 NOTEBOOKS := $(wildcard notebooks/*.ipynb)
+SEED ?= 0
 BENCHES := $(wildcard tests/benchmarks/bench_*.py)
 TWO := -n 2 --dist loadfile --no-loadscope-reorder
 QUICK = $(BIN)/python -m pytest -q $(TWO) -m "not slow and not nightly"
@@ -17,7 +18,7 @@ NEWEST = $(shell \
   done)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs test quick newest every nightly check bench mutants format clean
+.PHONY: help demo docs test quick newest every nightly check bench mutants fuzz format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | awk -F '\t' '{printf "make %-8s %s\n", $$1, $$2}'
@@ -66,6 +67,9 @@ endif
 
 mutants: $(VENV)/.dev-stamp ## faults planted in the package one by one, which tests must notice (hours; goes on where it was stopped)
 	$(BIN)/python tests/mutants/run.py
+
+fuzz: $(VENV)/.dev-stamp ## damaged files at every door, 100 000 of them (goes on where it was stopped; others with SEED=1)
+	$(BIN)/python -m tests.fuzz.run --seed $(SEED) --results .cache/fuzz/results-$(SEED).jsonl
 
 format: $(VENV)/.dev-stamp ## rewrite the sources in the project's format
 	$(BIN)/ruff format .
