@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from slipid.app.calibrate import calibrated, read_calibration
-from slipid.app.config import Config, read_config, single_floor_sections
+from slipid.app.config import Config, read_config, shape_of, single_floor_sections
 from slipid.app.floor_maps import map_files
 from slipid.app.identify import with_mixed_runs
 from slipid.app.logs import read_dataset
@@ -23,7 +23,6 @@ from slipid.app.problem import (
     FitTask,
     lag_from_motion,
     read_fit_task,
-    shape_of,
     with_mixed,
 )
 from slipid.data.check.columns import refuse_misordered

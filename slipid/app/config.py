@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from slipid.infer.bench.rows import Between
 from slipid.model import geometry as g
 from slipid.model.geometry import Geometry
+from slipid.support.errors import DataError
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -548,3 +549,11 @@ def geometry(robot: Wheels) -> Geometry:
     rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]
     places, shared = robot.wheel_places_m, robot.drive_of(len(robot.wheel_places_m))
     return g.general(places, robot.drive_directions_deg, rollers, radius, gear, shared)
+
+
+def shape_of(config: Config) -> Geometry:
+    """Return the geometry of a config's robot; raise `DataError` if such a robot cannot drive."""
+    try:
+        return geometry(config.content.wheels)
+    except ValueError as error:
+        raise DataError(f"{config.path}: robot: {error}") from error

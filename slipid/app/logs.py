@@ -8,7 +8,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from slipid.app.config import BenchMotors, Config, LogsSection, geometry
+from slipid.app.config import BenchMotors, Config, LogsSection, shape_of
 from slipid.data.gyro_heading import with_gyro_heading
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
@@ -113,7 +113,7 @@ def _with_wheels(config: Config, log: Log) -> Log:
     """
     if log.wheels or log.travel is None:
         return log
-    shape = geometry(config.content.wheels)
+    shape = shape_of(config)
     if shape.driven is not None:
         raise DataError(
             f"{log.path}: a twist is logged, but no wheel; expected wheel and steering angles of a "
@@ -126,7 +126,7 @@ def _with_wheels(config: Config, log: Log) -> Log:
 
 def _with_ends(config: Config, log: Log, ends: EndPoses) -> Log:
     """Return a log with the poses at its ends, whose heading must agree with the wheels."""
-    shape = geometry(config.content.wheels)
+    shape = shape_of(config)
     if shape.driven is None and shape.drives == log.wheels:
         yaw = np.asarray(shape.pseudo_inverse())[2] * float(shape.wheel_radius)
         ends.check_turn(float((log.wheel_angle[-1] - log.wheel_angle[0]) @ yaw))

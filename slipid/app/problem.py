@@ -22,8 +22,8 @@ from slipid.app.config import (
     FitSection,
     LogsSection,
     WeightsSection,
-    geometry,
     given_settings,
+    shape_of,
     single_floor_sections,
 )
 from slipid.app.floor_maps import map_path
@@ -553,14 +553,6 @@ def robot_for_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Rob
     """
     loads = {log.load for log in runs.logs}
     return robot.on(sorted(set(runs.surface)), sorted(loads), sorted(set(runs.session)), centre)
-
-
-def shape_of(config: Config) -> Geometry:
-    """Return the geometry of a config's robot; raise `DataError` if such a robot cannot drive."""
-    try:
-        return geometry(config.content.wheels)
-    except ValueError as error:
-        raise DataError(f"{config.path}: robot: {error}") from error
 
 
 _STATED = ("robot.wheel_radius", "robot.base_radius", "robot.mass")

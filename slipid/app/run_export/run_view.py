@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.app.calibrate import read_calibration
-from slipid.app.config import Config, LogsSection, read_config
+from slipid.app.config import Config, LogsSection, read_config, shape_of
 from slipid.app.floor_maps import map_path
 from slipid.app.logs import matching_files, read_dataset
-from slipid.app.problem import shape_of
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs

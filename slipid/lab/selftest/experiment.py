@@ -10,14 +10,13 @@ import numpy as np
 from scipy.stats import binom, chi2
 
 from slipid.app.check import expected
-from slipid.app.config import Config, read_config, single_floor_sections
+from slipid.app.config import Config, read_config, shape_of, single_floor_sections
 from slipid.app.logs import layout_of
 from slipid.app.problem import (
     ConfigFitTask,
     fit_task,
     read_fit_task,
     refuse_steered,
-    shape_of,
 )
 from slipid.data.runs import collect
 from slipid.fitting.problem import Problem
