@@ -151,6 +151,7 @@ def test_an_unknown_path_is_refused_with_the_choices(tree):
         (Choice("inner.gain", fixed=0.0), r"inner\.gain = 0\.0: expected inside"),
         (Choice("inner.gain", prior_std=-1.0), r"inner\.gain: prior std -1\.0; expected one pos"),
         (Choice("inner.place", prior_std=(1.0, 1.0, 1.0)), r"one per element \(2\)"),
+        (Choice("floor.a.creep", start=0.2, prior_mean=0.0, prior_std=0.1), r"inside \(0, inf\)"),
     ],
 )
 def test_values_outside_are_refused_by_name(tree, choice, message):

@@ -34,7 +34,7 @@ class Start:
 
     time: float
     pose: tuple[float, float, float]
-    std: tuple[float, float] = (0.0, 0.0)
+    std: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from slipid.deploy.deploy import DRAWS, deploy, read_robot
-from slipid.deploy.robot_record import DIRECTIONS
+from slipid.deploy.robot_record import DIRECTIONS, MOST_YAW_RATE, assumed_limits
 from slipid.fitting.shared_effects import SpeedAndLoad, TravelConditions
 from slipid.infer.fit_file import load
+from slipid.model.geometry import omni
+from slipid.model.robot import build
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.robot.limits import Limits
@@ -98,3 +100,13 @@ def test_after_sampling_no_two_files_disagree(fitted, sampled):
 def test_a_folder_without_a_robot_says_what_to_run(tmp_path):
     with pytest.raises(DataError, match=r"robot\.json: missing; write it by `slipid identify`"):
         read_robot(tmp_path)
+
+
+@pytest.mark.parametrize(("top", "yaw_rate"), [(5.0, 0.2 / 0.125), (50.0, MOST_YAW_RATE)])
+def test_a_robot_is_as_fast_as_its_wheels_allow_and_yaws_no_faster_than_is_usual(top, yaw_rate):
+    robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["gray"])
+    found = assumed_limits(robot, Setting(top), 2.0)
+    assert found.speed.value == pytest.approx(0.04 * top)
+    assert found.yaw_rate.value == pytest.approx(yaw_rate)
+    volt = 16.0 * float(robot.motor.back_emf) * top + 2.0 * float(robot.motor.resistance)
+    assert found.voltage.value == pytest.approx(volt)

@@ -21,7 +21,7 @@ class Inner(eqx.Module):
 
 
 class Floors(eqx.Module):
-    creep: Array = parameter(unit="1", symbol="s", start=0.3, lower=0.0)
+    creep: Array = parameter(unit="1", symbol="s", start=0.3, lower=0.0, closed=True)
     stiff: Array = parameter(unit="1", symbol="k", start=5.0, lower=1.0, upper=9.0, free=False)
     labels: tuple[str, ...] = eqx.field(static=True, default=())
 

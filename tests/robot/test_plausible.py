@@ -235,6 +235,15 @@ def test_ticks_of_a_coarse_encoder_all_count():
     assert rejected == 0
 
 
+def test_a_wheel_that_starts_at_once_is_believed_by_the_ticks_of_a_coarse_encoder():
+    """Two readings in a row differ by a tick, which is fast for a hundredth of a second."""
+    tick = 2 * np.pi / 20
+    angle = tick * np.floor(0.4 * np.maximum(np.arange(60) - 20, 0) / tick + 0.3)
+    found, rejected = rolled(angle, 0.01)
+    assert found.sum() == pytest.approx(angle[-1], abs=1e-9)
+    assert rejected <= 1
+
+
 # whatever comes in ---------------------------------------------------------------------------
 
 
