@@ -4,6 +4,7 @@ from pathlib import Path
 
 from slipid.data.reading.table import cells_of
 from slipid.support.errors import DataError
+from slipid.support.files import read_bytes
 
 
 def csv_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
@@ -19,9 +20,7 @@ def csv_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
         DataError: the file cannot be read, or is not text in UTF-8.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected {expected}") from error
+        text = read_bytes(path, expected).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not CSV text in UTF-8; expected {expected}") from error
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]

@@ -22,6 +22,10 @@ UNEVEN_RATE = 0.2
 frame rate still counts as even [1]."""
 READ_AHEAD = 8
 """Number of frames that are decoded in advance."""
+LARGEST_TIME = 1e10
+"""Largest size of a frame's time [s]; seconds since 1970 are below 2e9."""
+SLOWEST_FPS, FASTEST_FPS = 1e-5, 1e6
+"""Lowest and highest frame rate [1/s]."""
 Times = Float[np.ndarray, " frame"]
 """Times of frames [s]."""
 
@@ -125,8 +129,9 @@ def read_times(path: Path) -> Times:
             ) from None
         if number != len(times):
             raise bad_data(path, f"frame {number}", f"frame {len(times)}", row=line)
-        if not np.isfinite(at) or (times and at <= times[-1]):
-            raise bad_data(path, f"time {at:g}", "finite times that increase", row=line)
+        if not abs(at) <= LARGEST_TIME or (times and at <= times[-1]):
+            expected = f"finite times that increase, of size {LARGEST_TIME:g} s at most"
+            raise bad_data(path, f"time {at:g}", expected, row=line)
         times.append(at)
     return np.array(times)
 
@@ -135,10 +140,13 @@ def even_times(count: int, fps: float) -> Times:
     """Return the times [s] of frames at a constant rate `fps` [1/s], beginning at 0.
 
     Raises:
-        DataError: the rate is not a positive number.
+        DataError: the rate is not a positive number, or far from that of any camera.
     """
-    if not 0 < fps < np.inf:
-        raise DataError(f"--fps {fps:g}; expected a positive number of frames per second")
+    if not SLOWEST_FPS <= fps <= FASTEST_FPS:
+        raise DataError(
+            f"--fps {fps:g}; expected a positive number of frames per second, from "
+            f"{SLOWEST_FPS:g} to {FASTEST_FPS:g}"
+        )
     return np.arange(count) / fps
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, model_validator
 
 from slipid.camera.opencv import cv2, ideal_points
 from slipid.support.content import Content
@@ -24,7 +24,11 @@ from slipid.support.toml_file import Section, checked
 
 SCHEMA = "slipid.camera/1"
 Pixels = Annotated[int, Field(gt=0, le=100_000)]
-Row = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
+Within = Annotated[float, Field(ge=-1e6, le=1e6)]
+Row = Annotated[list[Within], Field(min_length=3, max_length=3)]
+Coefficient = Annotated[float, Field(ge=-1e4, le=1e4)]
+MOST_HEIGHT_M = 1e4
+"""Largest height of a camera above the floor [m]."""
 Three = Annotated[list[Row], Field(min_length=3, max_length=3)]
 
 
@@ -182,19 +186,25 @@ class CameraFile(Section):
     schema_: Literal["slipid.camera/1"] = Field(alias="schema")
     image_px: tuple[Pixels, Pixels]
     matrix: Three
-    distortion: list[FiniteFloat] = Field(default_factory=list, max_length=14)
+    distortion: list[Coefficient] = Field(default_factory=list, max_length=14)
     rotation_from_world: Three | None = None
     place_m: Row | None = None
-    frame_s: FiniteFloat | None = None
-    scale_std: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    frame_s: Annotated[float, Field(gt=0, le=1e5)] | None = None
+    scale_std: Annotated[float, Field(ge=0, le=1)] | None = None
     report: Content = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _possible(self) -> "CameraFile":
         """Raise `ValueError` for values that no camera can have."""
-        (fx, _, _), (_, fy, _), last = self.matrix
-        if not (fx > 0 and fy > 0 and last == [0, 0, 1]):
-            raise ValueError(f"matrix {self.matrix}; expected [[f, 0, x], [0, f, y], [0, 0, 1]]")
+        (fx, skew, cx), (zero, fy, cy), last = self.matrix
+        (width, height_px), near = self.image_px, True
+        for middle, size in ((cx, width), (cy, height_px)):
+            near = near and -size <= middle <= 2 * size
+        if not (min(fx, fy) >= 1 and near and skew == zero == 0 and last == [0, 0, 1]):
+            raise ValueError(
+                f"matrix {self.matrix}; expected [[f, 0, x], [0, f, y], [0, 0, 1]] in pixels, f "
+                "above 1, x and y in the image or near it"
+            )
         if (count := len(self.distortion)) not in (0, 4, 5, 8, 12, 14):
             raise ValueError(f"{count} distortion coefficients; expected 4, 5, 8, 12 or 14")
         if self.rotation_from_world is None or self.place_m is None:
@@ -206,11 +216,11 @@ class CameraFile(Section):
                 "rotation_from_world is not a rotation; expected an orthonormal matrix with "
                 "determinant 1"
             )
-        if not (height > 0 and rotation[2, 2] < 0):
+        if not (0 < height <= MOST_HEIGHT_M and rotation[2, 2] < 0):
             raise ValueError(
                 f"the camera is {height:g} m high and "
                 f"{'looks up' if rotation[2, 2] >= 0 else 'looks down'}; expected a camera above "
-                "the floor (z up) that looks down"
+                f"the floor (z up), {MOST_HEIGHT_M:g} m at most, that looks down"
             )
         return self
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from slipid.camera.opencv import MOST_PIXELS, cv2
 from slipid.support.errors import DataError
+from slipid.support.files import read_bytes
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """File suffixes by which images are recognised in folders and next to videos; an image file that a
@@ -40,10 +41,7 @@ def read_picture(path: Path, notes: list[str] | None = None) -> np.ndarray:
     Raises:
         DataError: the file is absent, empty, damaged or not an image, or has too many pixels.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected an image") from error
+    data = read_bytes(path, "an image")
     if not data:
         raise DataError(f"{path}: the file is empty; expected an image (PNG, JPEG, ...)")
     orientation, data = _without_orientation(data)

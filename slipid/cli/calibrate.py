@@ -1,6 +1,5 @@
 """`slipid calibrate`: calibrate the lens of an overhead camera and its pose above the floor."""
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +17,8 @@ if TYPE_CHECKING:
     from slipid.camera.calibration.quality import TooLittleCovered
     from slipid.report.page import Page
 
+MOST_M, MOST_DEG = 1e4, 3600.0
+"""Largest height above the floor [m] and size of an angle [deg]."""
 SIZE_STD = 0.001
 """Relative std of the lengths of a printed board or a measuring tape [1], by default."""
 
@@ -138,9 +139,9 @@ def calibrate(
         if points is not None:
             fit = floor_from_points(lens, points, std)
         elif floor is not None and isinstance(seen, Board):
-            if not 0 <= board_height < math.inf:
+            if not 0 <= board_height <= MOST_M:
                 raise DataError(
-                    f"--board-height {board_height:g}; expected a height in metres, 0 or more"
+                    f"--board-height {board_height:g}; expected a height in metres, 0 to {MOST_M:g}"
                 )
             fit = floor_from_board(lens, seen, floor, board_height, std)
         return _write(lens, fit, out, json, report)
@@ -167,11 +168,11 @@ def _refuse_combinations(
         )
 
 
-def _positive(option: str, value: float | None) -> float:
-    """Return the value of an option; raise `DataError` if it is missing or not above 0."""
-    if value is None or not 0 < value < math.inf:
+def _positive(option: str, value: float | None, most: float = 1.0) -> float:
+    """Return the value of an option; raise `DataError` if it is missing or not in 0 to `most`."""
+    if value is None or not 0 < value <= most:
         problem = "is missing" if value is None else f"{value:g}"
-        raise DataError(f"{option} {problem}; expected a number above 0")
+        raise DataError(f"{option} {problem}; expected a number above 0, {most:g} at most")
     return value
 
 
@@ -230,8 +231,8 @@ def _uncalibrated(
     from slipid.camera.calibration.calibrate import straight_camera
 
     per_pixel = _positive("--metres-per-pixel", described[0])
-    height, turn = _positive("--lens-height", described[1]), described[2] or 0.0
-    if not math.isfinite(turn):
+    height, turn = _positive("--lens-height", described[1], MOST_M), described[2] or 0.0
+    if not abs(turn) <= MOST_DEG:
         raise DataError(f"--turn {turn:g}; expected an angle in degrees")
     camera = straight_camera(picture, per_pixel, height, turn, size_std)
     camera.save(out)

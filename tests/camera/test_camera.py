@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from slipid.camera.calibration.calibrate import lens_from_file
 from slipid.camera.opencv import marker_dictionary
 from slipid.camera.overhead import OverheadCamera, read_camera
 from slipid.camera.picture_file import read_picture
@@ -82,6 +83,18 @@ WRONG = {
     "looks up": ({"rotation_from_world": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "looks up"),
     "under the floor": ({"place_m": [0, 0, -1]}, "-1 m high"),
     "a word": ({"place_m": [0, 0, "high"]}, "place_m"),
+    "infinite focal length": (
+        {"matrix": [[1e308, 0, 1], [0, 1e308, 1], [0, 0, 1]]},
+        r"matrix\[1\]\[1\]: 1e\+308; expected: .* less than or equal to 1000000",
+    ),
+    "no lens": ({"matrix": [[1e-9, 0, 1], [0, 1e-9, 1], [0, 0, 1]]}, "f above 1"),
+    "middle elsewhere": ({"matrix": [[500, 0, 1281], [0, 500, 1], [0, 0, 1]]}, "near it"),
+    "skew": ({"matrix": [[500, 3, 320], [0, 500, 180], [0, 0, 1]]}, "f, 0, x"),
+    "distortion": ({"distortion": [0, 0, 1e308, 0]}, r"distortion\[3\]: 1e\+308; expected"),
+    "far away": ({"place_m": [-1e308, 0, 2]}, r"place_m\[1\]: -1e\+308; expected"),
+    "in space": ({"place_m": [0, 0, 2e4]}, "20000 m high .* 10000 m at most"),
+    "vague": ({"scale_std": 1.5}, "scale_std: 1.5; expected"),
+    "backwards": ({"frame_s": -0.1}, "frame_s: -0.1; expected"),
     "spare": ({"colour": "red"}, "colour"),
 }
 
@@ -94,6 +107,13 @@ def test_wrong_files_are_refused(name, tmp_path):
     with pytest.raises(DataError, match=words) as refused:
         OverheadCamera.load(path)
     assert str(path) in str(refused.value)
+
+
+def test_a_report_of_other_programs_does_no_harm(tmp_path):
+    path = tmp_path / "camera.json"
+    report = {"lens": {"poor": 3}, "poor": 1, "notes": 2}
+    path.write_text(json.dumps(changed(report=report)), encoding="utf-8")
+    assert lens_from_file(path).report == {"lens": {"poor": 3}, "poor": [], "notes": []}
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", '"camera"', "\x00"])

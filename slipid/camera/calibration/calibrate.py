@@ -28,6 +28,9 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
+MOST_FOCAL_PX = 1e6
+"""Largest focal length of a camera [pixel]."""
+
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLens:
@@ -96,8 +99,13 @@ def lens_from_file(path: Path) -> CalibratedLens:
     lens = content.report.get("lens")
     if not isinstance(lens, dict):
         return CalibratedLens(content.lens, {})
-    notes = content.report.get("notes", [])
-    report = {"lens": lens, "poor": list(lens.get("poor", [])), "notes": list(notes)}
+    # another program may have written the report
+    poor, notes = lens.get("poor"), content.report.get("notes")
+    report = {
+        "lens": lens,
+        "poor": list(poor) if isinstance(poor, list) else [],
+        "notes": list(notes) if isinstance(notes, list) else [],
+    }
     return CalibratedLens(content.lens, report, _covariance(lens, 4 + len(content.lens.distortion)))
 
 
@@ -177,6 +185,11 @@ def straight_camera(
     notes: list[str] = []
     image_px = size_of(read_picture(picture, notes))
     camera = OverheadCamera.straight_down(image_px, metres_per_pixel, height_m, turn_deg)
+    if not 1 <= camera.lens.matrix[0, 0] <= MOST_FOCAL_PX:
+        raise DataError(
+            f"{height_m:g} m above the floor, {metres_per_pixel:g} m per pixel give a focal length "
+            f"of {camera.lens.matrix[0, 0]:g} pixels; expected 1 to {MOST_FOCAL_PX:g}"
+        )
     report = {"floor": straight_report(camera), "poor": [], "notes": notes}
     return replace(camera, scale_std=size_std, report=report)
 

@@ -13,6 +13,8 @@ from slipid.support.errors import DataError, bad_data, did_you_mean
 COLUMNS = ("u", "v", "x", "y")
 EXPECTED = "u, v (pixels), x, y (metres) and perhaps z"
 """Columns of a file of points, for messages."""
+MOST_PIXEL, MOST_M = 1e5, 1e5
+"""Largest size of a pixel coordinate [pixel] and of a coordinate on the floor [m]."""
 LEAST_POINTS = 4
 """Smallest number of points that determine the pose of a camera."""
 LINE_WIDTH = 0.02
@@ -108,7 +110,8 @@ def _number(path: Path, line: int, row: list[str], name: str, header: list[str])
         value = float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
+    most = MOST_PIXEL if name in ("u", "v") else MOST_M
+    if not abs(value) <= most:
         shown = f"'{text}'" if text else "nothing"
-        raise bad_data(path, shown, "a number", row=line, column=name)
+        raise bad_data(path, shown, f"a number from -{most:g} to {most:g}", row=line, column=name)
     return value

@@ -32,12 +32,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat
+from pydantic import Field
 
 from slipid.camera.opencv import marker_count
 from slipid.support.errors import DataError
-from slipid.support.toml_file import Positive, Section, checked, mapping_of, text_of
+from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
+MOST_SIZE_M, MOST_HEIGHT_M = 10.0, 1000.0
+"""Largest edge length of a marker, and its largest height above the floor [m]."""
+Aside = Annotated[float, Field(ge=-100, le=100)]
 Id = Annotated[int, Field(ge=0, strict=True)]
 
 
@@ -116,10 +119,10 @@ class Target:
 class _Placed(Section):
     """Size, position and direction of a marker or a board on the body."""
 
-    size_m: Positive
-    height_m: FiniteFloat
-    place_m: tuple[FiniteFloat, FiniteFloat] = (0.0, 0.0)
-    yaw_deg: FiniteFloat = 0.0
+    size_m: Annotated[float, Field(gt=0, le=MOST_SIZE_M, strict=True)]
+    height_m: Annotated[float, Field(ge=0, le=MOST_HEIGHT_M)]
+    place_m: tuple[Aside, Aside] = (0.0, 0.0)
+    yaw_deg: Annotated[float, Field(ge=-3600, le=3600)] = 0.0
 
 
 class _Single(_Placed):
@@ -134,7 +137,7 @@ class _Board(_Placed):
     first_id: Id
     columns: Annotated[int, Field(ge=1, le=100)]
     rows: Annotated[int, Field(ge=1, le=100)]
-    gap_m: Positive
+    gap_m: Annotated[float, Field(gt=0, le=MOST_SIZE_M, strict=True)]
 
     def markers(self) -> list[Marker]:
         """Return the board's markers row by row, beginning ahead on the left."""
@@ -153,7 +156,7 @@ class _Board(_Placed):
 class _Target(Section):
     """A body and its markers."""
 
-    name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")] = "robot"
+    name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$", max_length=60)] = "robot"
     dictionary: str = "4X4_50"
     marker: list[_Single] = Field(default_factory=list)
     board: list[_Board] = Field(default_factory=list)

@@ -210,6 +210,7 @@ POINTS = "u,v,x,y\n100,100,0,1\n500,100,1,1\n500,400,1,0\n100,400,0,0\n"
         ("", "the file is empty"),
         ("u,v,x\n1,2,3\n", "no column y.*expected u, v"),
         (POINTS.replace("500,400", "many,400"), "row 4, column 'u': 'many'; expected a number"),
+        (POINTS.replace("500,400", "500,1e308"), "row 4, column 'v': '1e308'; expected .* 100000"),
         (POINTS.replace("500,400", "nan,400"), "row 4, column 'u': 'nan'"),
         (POINTS.replace("1,0\n", "1\n"), "row 4, column 'y': nothing"),
         (POINTS.replace("500,400", "900,400"), "row 4: u = 900.*640 x 480"),

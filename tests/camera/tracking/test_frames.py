@@ -227,6 +227,7 @@ WRONG_TIMES = {
     "frame,time\n0,0\n1,0\n": "times that increase",
     "frame,time\n0,0\n1,nan\n": "times that increase",
     "frame,time\n0,inf\n": "times that increase",
+    "frame,time\n0,-1e308\n": r"row 2: time -1e\+308; expected .* of size 1e\+10 s at most",
     "frame,time\n0,0\n1\n": "a frame number and its time",
     "frame,time\n0,zero\n": "a frame number and its time",
     "frame,time\n0,0\n\n": "a frame number and its time",
@@ -246,7 +247,7 @@ def test_files_that_are_no_times(tmp_path):
         read_times(tmp_path / "t.csv")
     with pytest.raises(DataError, match="expected times of frames"):
         read_times(tmp_path)
-    for fps in (0.0, -1.0, float("nan"), float("inf")):
+    for fps in (0.0, -1.0, 1e308, 1e-308, float("nan"), float("inf")):
         with pytest.raises(DataError, match="expected a positive number of frames per second"):
             even_times(3, fps)
 
