@@ -28,11 +28,12 @@ from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
 from slipid.infer.bench.rows import Between
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.infer.feedforward import bench_feedforwards
+from slipid.infer.result_folder import files_of_fit
 from slipid.parameter import entries
 from slipid.search_space import Choice
 from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
-from slipid.support.files import writable, write_json
+from slipid.support.files import json_text, writable, write_json, write_together
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -277,7 +278,7 @@ def identify_bench(
     fit = task.fit(report)
     writable(out)
     content = bench_content(fit)
-    write_json(out / "identified.json", content)
+    write_together({out / "identified.json": json_text(content).encode()}, files_of_fit(out))
     gains = write_gains(out, bench_feedforwards(fit))
 
     inputs: Content = {

@@ -1,5 +1,6 @@
 """Calibration of a robot's kinematics from the logs of a config, without a force balance."""
 
+import json
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -14,7 +15,8 @@ from slipid.app.problem import ConfigFitTask, FitTask
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration.result import ABSURD, Calibration
-from slipid.infer.fit_file import FIT, IDENTIFIED, SCHEMA
+from slipid.infer.fit_file import SCHEMA
+from slipid.infer.result_folder import FIT, IDENTIFIED, files_of_fit, fit_of
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
@@ -27,7 +29,14 @@ from slipid.predict.selection import (
 )
 from slipid.search_space import Space
 from slipid.support.errors import DataError
-from slipid.support.files import read_json, writable, write_json
+from slipid.support.files import (
+    checksum,
+    json_text,
+    read_json,
+    writable,
+    write_json,
+    write_together,
+)
 from slipid.support.progress import COMPILING_S, Reporter
 
 
@@ -245,7 +254,9 @@ def calibrate_only(
         "trust": found.trust.to_json(),
         "data": {"hash": task.data_hash, "runs": runs},
     }
-    write_json(out / IDENTIFIED, content)
+    content = json.loads(json_text(content))
+    content |= {"fit": checksum(content)}
+    write_together({out / IDENTIFIED: json_text(content).encode()}, files_of_fit(out))
     write_run(task, found.trust, data, out, time.monotonic() - began)
     return replace(found, written=(IDENTIFIED, "run.json", "config.toml"))
 
@@ -277,6 +288,7 @@ def read_calibration(out: Path) -> CalibrationFile:
     Raises:
         DataError: there is no such file, or no calibration in it.
     """
+    fit_of(out)
     content = read_json(out / IDENTIFIED, "a result of `slipid identify`")
     try:
         calibration, models = Calibration.of_json(content["calibration"]), content["selected_model"]
@@ -295,5 +307,6 @@ def write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds:
     copy_maps(map_files(config), out)
     logs = {log.name: log.sha256 for log in task.logs}
     inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}
-    verdict = {"trust": trust.to_json(), "seed": task.settings.seed}
+    fit = read_json(out / IDENTIFIED, "the result that was just written")["fit"]
+    verdict = {"trust": trust.to_json(), "seed": task.settings.seed, "fit": fit}
     write_run_file(out, config, inputs, seconds, verdict)

@@ -79,7 +79,8 @@ def identify(
 ) -> IdentifyResult:
     """Return the fit of a config's robot to its logs, and write all results to `out`.
 
-    If `out` has the checkpoint of the same fit, which was interrupted, the fit resumes from it.
+    If `out` has the checkpoint of the same fit, which was interrupted, the fit resumes from it. The
+    checkpoint stays until `forget_checkpoint` is called, after robot and page were written.
 
     Args:
         task: runs and config, from `checked_task`.
@@ -125,8 +126,12 @@ def identify(
         each = {p.path: asdict(p) for p in result}
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written = (*written, "profile.json")
-    (out / f"{CHECKPOINT}.npz").unlink(missing_ok=True)
     return IdentifyResult(fit, task, tuple(result), written)
+
+
+def forget_checkpoint(out: Path) -> None:
+    """Delete the checkpoint of a fit, all of whose results have been written."""
+    (out / f"{CHECKPOINT}.npz").unlink(missing_ok=True)
 
 
 def checked_task(

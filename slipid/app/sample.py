@@ -9,17 +9,19 @@ import numpy as np
 from slipid.app.config import read_config
 from slipid.app.logs import log_folder
 from slipid.app.problem import ConfigFitTask, read_fit_task, with_mixed
+from slipid.deploy.deploy import write_robot
 from slipid.fitting.multi_floor import multi_floor_runs
-from slipid.infer.fit_file import load, write_identified
+from slipid.infer.fit_file import load
 from slipid.infer.posterior import sample as netcdf
 from slipid.infer.posterior.blocks import FORMAT, Plan
 from slipid.infer.posterior.diagnosis import Posterior, identified
 from slipid.infer.posterior.sample import sampled
 from slipid.infer.result import Fit
+from slipid.infer.result_folder import IDENTIFIED, ROBOT, fit_of
 from slipid.support.checkpoint import Checkpoint, key_of, versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import write_json
+from slipid.support.files import json_text, write_together
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import COMPILING_S, Reporter
 
@@ -27,8 +29,12 @@ FOLDER = "sampling"
 """Name of the folder, inside the result folder, with the blocks of an unfinished chain."""
 
 
-WRITTEN = ("posterior.nc", "sample.json", "identified.json")
+WRITTEN = ("posterior.nc", "sample.json", IDENTIFIED, ROBOT)
 """Names of the files that `sample` writes."""
+OF_SAMPLE = (
+    *(ROBOT, "sample.json", "posterior.nc", "posterior_intervals.png", "posterior_pairs.png"),
+)
+"""Names of the files of an earlier posterior, which are deleted before they are replaced."""
 
 
 def sample(
@@ -36,8 +42,9 @@ def sample(
 ) -> tuple[Posterior, Content]:
     """Return draws of the posterior of the fit in `out`, and the content of sample.json.
 
-    The draws are written to `out` as posterior.nc, and the content as sample.json. The file
-    identified.json is replaced; it then has the intervals of the posterior. An interrupted chain
+    The draws are written to `out` as posterior.nc, and the content as sample.json. The files
+    identified.json and robot.json are replaced; they then have the intervals and draws of the
+    posterior. An interrupted chain
     resumes where it stopped.
 
     Args:
@@ -68,11 +75,18 @@ def sample(
     kept = Checkpoint(out / FOLDER, key_of(*inputs, np.asarray(fit.z), np.asarray(fit.covariance)))
     posterior = sampled(fit, plan, draws, kept, report)
     report.stage("predictions of the draws, and writing", usual_s=COMPILING_S)
-    about = _summary(posterior, plan, time.monotonic() - began)
+    mark = fit_of(out)
+    about = _summary(posterior, plan, time.monotonic() - began) | {"fit": mark}
     marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict) and k != "schema"}
-    netcdf.write(netcdf.tree(posterior, marks), out / "posterior.nc")
-    write_identified(out, identified(posterior))
-    write_json(out / "sample.json", about)
+    path = out / "posterior.nc"
+    content = identified(posterior) | {"fit": mark}
+    files = {
+        out / IDENTIFIED: json_text(content).encode(),
+        out / "sample.json": json_text(about).encode(),
+        path: netcdf.packed(netcdf.tree(posterior, marks), path),
+    }
+    write_together(files, [out / name for name in OF_SAMPLE])
+    write_robot(out, posterior)
     if posterior.converged:
         kept.remove()
     return posterior, about

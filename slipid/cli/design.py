@@ -91,9 +91,10 @@ def write(found: "Design", out: Path, report: Reporter) -> list[str]:
     If the design proposes no runs, the files of an earlier design are removed.
     """
     from slipid.infer.design.proposal import commands
+    from slipid.infer.result_folder import fit_of
     from slipid.support.files import write_bytes, write_json
 
-    write_json(out / "design.json", found.content)
+    write_json(out / "design.json", {**found.content, "fit": fit_of(out)})
     table, picture = out / "design_commands.csv", out / "design.png"
     if not found.runs:
         for old in (table, picture):

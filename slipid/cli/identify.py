@@ -112,16 +112,16 @@ def calibration(
 ) -> "CalibrationResult":
     """Return the calibration of a robot's kinematics alone, and write its results."""
     from slipid.app.calibrate import calibrate_only
-    from slipid.deploy.deploy import ROBOT, calibrated_robot
+    from slipid.deploy.deploy import calibrated_robot, switch_robot
     from slipid.report.html.fit_page import write_calibration_report
 
     done = calibrate_only(task, data, out, report)
     robot = calibrated_robot(
         done.calibration, task.robot, done.models, task.dataset, task.robot_settings
     )
-    robot.save(out / ROBOT)
+    written = (*done.written, *switch_robot(out, robot))
     page = write_calibration_report(done, out, report)
-    return replace(done, written=(*page, *done.written, ROBOT))
+    return replace(done, written=(*page, *written))
 
 
 def run(
@@ -138,7 +138,7 @@ def run(
     Raises:
         DataError: as in `slipid.app.identify.identify`.
     """
-    from slipid.app.identify import identify
+    from slipid.app.identify import forget_checkpoint, identify
     from slipid.deploy.deploy import write_robot
     from slipid.report.html.fit_page import write_fit_report
 
@@ -147,6 +147,7 @@ def run(
     if can_draw(report):
         written += tuple(path.name for path in _draw(done, out, report))
     page = write_fit_report(done.fit, done.task, out, report)
+    forget_checkpoint(out)
     return replace(done, written=(*page, *written))
 
 

@@ -53,11 +53,10 @@ def sample(
     require_packages()
     from slipid.app.sample import WRITTEN
     from slipid.app.sample import sample as run
-    from slipid.deploy.deploy import write_robot
 
     with Reporter(quiet=quiet) as report, locked(out, "sample"):
         posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
-        written = [*WRITTEN, *write_robot(out, posterior)]
+        written = [*WRITTEN]
         if can_draw(report):
             from slipid.plots.posterior import posterior_plots
 

@@ -60,15 +60,15 @@ def run(
     Arguments are those of `slipid.app.compare.validate`.
     """
     from slipid.app.compare import validate, validate_calibration
-    from slipid.infer.fit_file import FIT, IDENTIFIED
+    from slipid.infer.result_folder import FIT, IDENTIFIED, fit_of
     from slipid.support.files import write_json
 
     if (out / IDENTIFIED).exists() and not (out / FIT).exists():
-        content = validate_calibration(out, data, report, logs).to_json()
+        content = validate_calibration(out, data, report, logs).to_json() | {"fit": fit_of(out)}
         write_json(out / VALIDATION, content)
         return content, [VALIDATION]
     fit, dataset, found = validate(out, data, report, logs)
-    content = found.to_json()
+    content = found.to_json() | {"fit": fit_of(out)}
     write_json(out / VALIDATION, content)
     written = [VALIDATION]
     if can_draw(report):

@@ -15,9 +15,9 @@ from slipid.data.runs import Runs
 from slipid.deploy.robot_record import effects_by_load, robot_record
 from slipid.exports.feedforward import gains_json
 from slipid.fitting.calibration.result import Calibration
-from slipid.infer.fit_file import IDENTIFIED, write_identified
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.result import Fit, draws
+from slipid.infer.result_folder import IDENTIFIED, ROBOT, fit_of
 from slipid.infer.verdicts.draws import some_of
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
@@ -46,14 +46,13 @@ from slipid.robot.record import (
     plain,
     rows_of,
 )
-from slipid.robot.robot_file import typed
+from slipid.robot.robot_file import robot_bytes, typed
 from slipid.robot.twin import LONGEST_DELAY_S, ActuatorModel
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
-from slipid.support.files import hash_of, read_json
+from slipid.support.files import hash_of, json_text, read_json, write_together
 
-ROBOT = "robot.json"
 DRAWS = 64
 """Number of posterior draws in robot.json."""
 
@@ -287,10 +286,40 @@ def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
     The feed-forward and feedback gains of the robot are added to identified.json.
     """
     robot = deploy(found)
-    robot.save(out / ROBOT)
-    gains = gains_json(robot_feedforwards(robot))
-    write_identified(out, read_json(out / IDENTIFIED, "the result of a fit") | gains)
+    return switch_robot(out, robot, gains_json(robot_feedforwards(robot)))
+
+
+def switch_robot(
+    out: Path, robot: DeployedRobot, gains: Mapping[str, object] = MappingProxyType({})
+) -> tuple[str, ...]:
+    """Write robot.json into the folder of a fit; return the names of the written files.
+
+    The hash of the robot's numbers, by which `robot_of_folder` recognizes it, and the gains are
+    added to identified.json.
+    """
+    content = read_json(out / IDENTIFIED, "the result of a fit")
+    content |= {**gains, "robot": robot.record.numbers}
+    files = {IDENTIFIED: json_text(content).encode(), ROBOT: robot_bytes(robot.record)}
+    write_together({out / name: data for name, data in files.items()}, [out / ROBOT])
     return (ROBOT,)
+
+
+def robot_of_folder(out: Path, load: str | None = None) -> DeployedRobot:
+    """Return the robot in a result folder, with the load set-up of a name or the first one.
+
+    Raises:
+        DataError: reading it fails as in `DeployedRobot.load`, or it is not the robot of the fit.
+    """
+    robot = DeployedRobot.load(out / ROBOT, load)
+    fit_of(out)
+    path = out / IDENTIFIED
+    about = read_json(path, "the result of a fit") if path.exists() else {}
+    if about.get("robot", robot.record.numbers) != robot.record.numbers:
+        raise DataError(
+            f"{out / ROBOT}: not the robot of the fit in {path}; run `slipid identify`, or "
+            "`slipid sample` after it, again"
+        )
+    return robot
 
 
 def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()) -> DeployedRobot:
@@ -306,7 +335,7 @@ def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()
     path = source if source.suffix == ".json" else source / ROBOT
     if not path.is_file():
         raise DataError(f"{path}: missing; write it by `slipid identify` with --out {path.parent}")
-    robot = DeployedRobot.load(path, load)
+    robot = DeployedRobot.load(path, load) if path == source else robot_of_folder(source, load)
     if not robot.has_controller:
         raise DataError(f"{path}: {NO_CONTROLLER}")
     try:

@@ -2,7 +2,8 @@
 
 identified.json is a table for people and other programs. One checksum covers the whole fit. The
 renaming of a new fit.json over the old one replaces an old fit in one step: if the process ends
-before that, the folder still holds the old fit, otherwise the new one.
+before that, the folder still holds the old fit, otherwise the new one. What depends on the old fit
+is deleted just before, see `slipid.infer.result_folder`.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.shared_effects import FittedEffects, SpeedAndLoad
 from slipid.infer.held_out import HeldOut
 from slipid.infer.result import Channels, Fit
+from slipid.infer.result_folder import FIT, IDENTIFIED, files_of_fit, fit_of
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.draws import Draws
 from slipid.infer.verdicts.estimates import Estimate
@@ -30,10 +32,9 @@ from slipid.predict.selection import FloorSelection
 from slipid.search_space import Choice, Space, with_values
 from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import checksum, json_text, read_json, write_bytes
+from slipid.support.files import checksum, json_text, read_json, write_together
 from slipid.support.parsing import arrays_of
 
-FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
 SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/9"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
@@ -55,21 +56,13 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
     content = to_json(fit) | {"arrays": {"file": name, "sha256": sha256}}
     content = json.loads(json_text(content))
     content |= {"checksum": checksum(content)}
-    table = json_text(identified_json(fit))
-    write_bytes(folder / name, arrays)
-    # After this line the folder contains the new fit, so that files of the old one can be deleted.
-    write_bytes(folder / FIT, json_text(content).encode())
-    write_identified(folder, json.loads(table))
+    table = json_text(identified_json(fit) | {"fit": content["checksum"]})
+    files = {name: arrays, FIT: json_text(content).encode(), IDENTIFIED: table.encode()}
+    write_together({folder / k: data for k, data in files.items()}, files_of_fit(folder))
     for old in folder.glob("fit-????????????.npz"):
         if old.name != name:
             old.unlink()
     return IDENTIFIED, FIT, name
-
-
-def write_identified(folder: Path, content: Content) -> None:
-    """Write identified.json next to fit.json, with the checksum of that fit."""
-    fit = read_json(folder / FIT, _RESULT)
-    write_bytes(folder / IDENTIFIED, json_text(content | {"fit": fit["checksum"]}).encode())
 
 
 def load(folder: Path) -> Fit:
@@ -84,7 +77,7 @@ def load(folder: Path) -> Fit:
     if found != SCHEMA_FIT:
         what = f"its schema is {found}" if isinstance(found, str) else "it has no schema"
         raise DataError(f"{path}: {what}; expected {SCHEMA_FIT}, {_RESULT} of this version")
-    if content.pop("checksum", None) != (mark := checksum(content)):
+    if content.pop("checksum", None) != checksum(content):
         raise DataError(f"{path}: damaged or edited, its checksum differs; expected {_RESULT}")
     try:
         fit = from_json(content, _unpacked(folder, **content["arrays"]))
@@ -92,13 +85,7 @@ def load(folder: Path) -> Fit:
         if isinstance(error, DataError):
             raise
         raise DataError(f"{path}: {error}; expected {_RESULT} of this version") from error
-    table = folder / IDENTIFIED
-    other = read_json(table, _RESULT) if table.exists() else {"fit": mark}
-    if not isinstance(other, dict) or other.get("fit") != mark:
-        raise DataError(
-            f"{table}: belongs to another fit than {FIT} in this folder, since writing was "
-            "interrupted; expected both from the same fit (run `slipid identify` again)"
-        )
+    fit_of(folder)
     return fit
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 from dataclasses import replace
 
@@ -20,7 +21,6 @@ from slipid.data.windows import UNREAD_VARIANCE, windows
 from slipid.fitting.optimise import Optimum, one_round
 from slipid.fitting.problem import FitState, Problem
 from slipid.fitting.variances import DEGREES
-from slipid.infer import fit_file
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.fit_file import identified_json, load, save, to_json
 from slipid.infer.posterior import diagnosis
@@ -43,7 +43,9 @@ from slipid.predict.validation import validation
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
 from slipid.support.files import hash_of
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
+from tests.helpers.killed_writes import Killed, dies_at
 
 pytestmark = pytest.mark.slow  # traces whole fits
 
@@ -463,23 +465,6 @@ def test_a_fit_that_converged_has_a_chain_if_it_is_wanted(monkeypatch):
     assert chain(replace(fit, refused={"reason": "they contradict"}), "sampled") is found
 
 
-class Killed(BaseException):
-    """Stand-in for the death of a process."""
-
-
-def dies_after(monkeypatch, writes: int) -> None:
-    """Let the next writing process die after so many of its files."""
-    done = iter(range(writes))
-    write = fit_file.write_bytes
-
-    def until(path, data):
-        if next(done, None) is None:
-            raise Killed
-        write(path, data)
-
-    monkeypatch.setattr(fit_file, "write_bytes", until)
-
-
 OLD = 4.0
 """A number that distinguishes two fits, in JSON and in an array."""
 
@@ -489,29 +474,30 @@ def of_two() -> tuple[Fit, Fit]:
     return old, fit_of(True)
 
 
-@pytest.mark.parametrize("writes", [0, 1, 2, 3])
-def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(
-    tmp_path, monkeypatch, writes
-):
+def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(tmp_path):
     old, new = of_two()
-    save(old, tmp_path)
-    with monkeypatch.context() as patch:
-        dies_after(patch, writes)
-        if writes < 3:
-            with pytest.raises(Killed):
-                save(new, tmp_path)
-        else:
-            save(new, tmp_path)
-    if writes == 2:  # identified.json is still the old one's
-        with pytest.raises(DataError, match="belongs to another fit than"):
-            load(tmp_path)
-        (tmp_path / "identified.json").unlink()
-    back, expected = load(tmp_path), new if writes >= 2 else old
-    assert back.remaining == expected.remaining
-    np.testing.assert_array_equal(back.laplace, expected.laplace)
-    names = save(new, tmp_path)  # and the next one cleans up
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
-    assert load(tmp_path).remaining == new.remaining
+    found = []
+    for step in itertools.count():
+        folder = tmp_path / str(step)
+        save(old, folder)
+        ended = False
+        with contextlib.suppress(Killed), dies_at(step):
+            save(new, folder)
+            ended = True
+        back = load(folder)
+        expected = old if back.remaining == OLD else new
+        assert to_json(back) == to_json(expected)
+        np.testing.assert_array_equal(back.laplace, expected.laplace)
+        found.append(back.remaining)
+        names = save(new, folder)  # and the next one cleans up
+        with locked(folder, "identify"):
+            assert sorted(p.name for p in folder.glob("[!.]*")) == sorted(names)
+        assert sorted(p.name for p in folder.iterdir()) == sorted(names)
+        assert load(folder).remaining == new.remaining
+        if ended:
+            break
+    assert found == sorted(found, reverse=True)  # first the old one, from some step on the new one
+    assert (found[0], found[-1], len(found)) == (OLD, new.remaining, 9)
 
 
 def test_a_file_of_another_fit_is_noticed(tmp_path):

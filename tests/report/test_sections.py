@@ -14,6 +14,7 @@ from slipid.report.html.evidence import FitEvidence, Quarters, write_evidence
 from slipid.report.html.fit_page import fit_page
 from slipid.report.html.results import read_results
 from slipid.report.html.sections.predictions import _played
+from slipid.support.errors import DataError
 
 
 def value(x, half, verdict="identified", unit="m"):
@@ -277,13 +278,32 @@ def test_a_robot_is_not_compared_with_itself(folder):
     assert "warthog" in robots
 
 
-def test_results_that_are_older_than_the_fit_are_left_out(folder):
-    (folder / "design.json").write_text(json.dumps({"runs": [], "messages": []}))
-    (folder / "trial.json").write_text("not even JSON")
-    os.utime(folder / "trial.json", (1e9, 1e9))
+def test_results_of_another_fit_are_left_out_whatever_their_times(folder):
+    for name, mark in (("identified", "fit 2"), ("run", "fit 2"), ("trial", "fit 1")):
+        path = folder / f"{name}.json"
+        content = json.loads(path.read_text()) if path.exists() else {}
+        path.write_text(json.dumps(content | {"fit": mark}))
+    (folder / "design.json").write_text(
+        json.dumps({"runs": [], "messages": [], "reachable": [], "fit": "fit 2"})
+    )
+    (folder / "comparison.json").write_text(json.dumps({"data": {"hash": "of other logs"}}))
+    os.utime(folder / "design.json", (1e9, 1e9))  # the clock was set back
     found = read_results(folder)
-    assert (found.outdated, found.trial, found.design is None) == (("trial",), None, False)
-    assert "Left out, as older than the fit: trial.json" in words(page_of(folder)["data"])
+    assert found.outdated == ("comparison", "trial")
+    assert (found.trial, found.comparison, found.design is None) == (None, None, False)
+    shown = words(page_of(folder)["data"])
+    assert "Left out, as of another fit: comparison.json and trial.json" in shown
+
+
+def test_a_folder_with_files_of_two_fits_is_refused_with_what_to_do(folder):
+    for name, mark in (("identified", "fit 2"), ("run", "fit 1")):
+        path = folder / f"{name}.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": mark}))
+    with pytest.raises(DataError, match=r"run\.json: belongs to another fit than .*again\)"):
+        read_results(folder)
+    (folder / "run.json").unlink()
+    with pytest.raises(DataError, match=r"run\.json: missing, since .* interrupted; run `slipid"):
+        read_results(folder)
 
 
 def test_a_posterior_that_has_not_converged_is_a_warning_with_the_command_to_type(folder):

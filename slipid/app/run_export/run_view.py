@@ -20,7 +20,7 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import incomplete_poses
-from slipid.deploy.deploy import ROBOT
+from slipid.deploy.deploy import robot_of_folder
 from slipid.deploy.floors import floor_of
 from slipid.deploy.replay import EstimatedRun, Start, estimated
 from slipid.infer.body_path import (
@@ -31,12 +31,12 @@ from slipid.infer.body_path import (
     moved_to_start,
     times,
 )
-from slipid.infer.fit_file import FIT, load
+from slipid.infer.fit_file import load
 from slipid.infer.motion_models import MotionModels
 from slipid.infer.replayed_paths import replayed_over_floors
+from slipid.infer.result_folder import FIT, ROBOT
 from slipid.predict import open_loop as replay
 from slipid.predict.selection import aligned_path
-from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.support.errors import DataError, first_names
 from slipid.support.files import read_json
@@ -285,7 +285,7 @@ def _estimate(
     """
     if not (out / ROBOT).is_file():
         return None, [f"{out / ROBOT}: missing, so that neither slip nor floors are estimated"]
-    robot = DeployedRobot.load(out / ROBOT, log.load)
+    robot = robot_of_folder(out, log.load)
     known = None if floor is None else floor_of(floor, robot.labels)
     path, std = paths.get("selected", paths["nominal"]), (0.0, 0.0)
     if log.pose is not None and np.isfinite(log.pose).all():

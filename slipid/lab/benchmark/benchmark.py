@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.deploy.deploy import ROBOT, robot_of_force_balance
+from slipid.deploy.deploy import robot_of_force_balance
+from slipid.infer.result_folder import ROBOT
 from slipid.lab.benchmark.floors.protocol import FloorTask
 from slipid.lab.benchmark.floors.tasks import HuskyFloorTask, RobotinoFloorTask, husky_classifiers
 from slipid.lab.benchmark.protocols import PROTOCOLS, splits

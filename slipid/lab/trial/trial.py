@@ -29,6 +29,7 @@ from slipid.deploy.twin_run import (
     twin_floor,
     twin_plant,
 )
+from slipid.infer.result_folder import fit_of
 from slipid.lab.testsite.config import plan
 from slipid.lab.testsite.driving import PERIOD, RimSpeeds
 from slipid.lab.testsite.plant import SimulatedRobot
@@ -198,6 +199,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
         "summary": summaries(runs),
         "controllers": {name: ROWS[name].about for name in rows},
         "runs": [run.to_json() for run in runs],
+        "fit": fit_of(out),
     }
     write_json(out / "trial.json", content)
     paths = {name: path for name, (_, path) in driven.items()}

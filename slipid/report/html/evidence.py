@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from slipid.infer.result_folder import fit_of
 from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
 
@@ -196,6 +197,7 @@ class FitEvidence(_Record):
     Attributes:
         schema_: name and version of the format.
         data_hash: hash of the logs, which run.json and identified.json repeat.
+        fit: checksum of the fit, which `write_evidence` adds; None in files of older versions.
         wheels: wheels of the robot.
         runs: runs on one floor each, with their paths; empty if poses lack coordinates.
         over_floors: runs over several floors, with their paths.
@@ -209,6 +211,7 @@ class FitEvidence(_Record):
 
     schema_: str = SCHEMA
     data_hash: str
+    fit: str | None = None
     wheels: WheelLayout
     runs: list[RunEvidence]
     over_floors: list[RunEvidence] = []
@@ -223,6 +226,7 @@ class FitEvidence(_Record):
 def write_evidence(found: FitEvidence, out: Path) -> Path:
     """Write evidence.json to a folder and return its path."""
     path = out / EVIDENCE
+    found = found.model_copy(update={"fit": fit_of(out)})
     write_bytes(path, found.model_dump_json().encode())
     return path
 

@@ -6,9 +6,10 @@ from slipid.app.calibrate import CalibrationResult
 from slipid.app.config import read_config
 from slipid.app.logs import log_folder
 from slipid.app.problem import FitTask, read_fit_task
-from slipid.infer.fit_file import FIT, load
+from slipid.infer.fit_file import load
 from slipid.infer.motion_models import MotionModels
 from slipid.infer.result import Fit
+from slipid.infer.result_folder import FIT
 from slipid.report.html.blocks import badge
 from slipid.report.html.evidence import EVIDENCE, FitEvidence, write_evidence
 from slipid.report.html.gather import evidence_of_fit, evidence_of_runs

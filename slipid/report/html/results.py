@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slipid.infer.fit_file import FIT, IDENTIFIED
+from slipid.infer.result_folder import FIT, IDENTIFIED, fit_of, refuse_other_fit
 from slipid.report.html.evidence import EVIDENCE, FitEvidence, read_evidence
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -17,8 +17,6 @@ RESULT = "a result of `slipid identify`"
 DRAWS = "posterior.nc"
 LATER = ("validation", "comparison", "trial", "design", "sample")
 """Names of the commands whose results a page shows, and of their files without .json."""
-COPIED_S = 60.0
-"""Largest difference of the times of files that were copied together [s]."""
 MOST_DRAWS = 1500
 """Largest number of draws of a posterior that are shown."""
 
@@ -27,7 +25,7 @@ MOST_DRAWS = 1500
 class Results:
     """Contents of the files in a result folder; None for a file that is absent.
 
-    Files that are older than the fit belong to an earlier one in the same folder, and are not read.
+    Files of a different fit, and a comparison of other logs, are not read.
 
     Attributes:
         folder: the result folder.
@@ -40,7 +38,7 @@ class Results:
         draws: draws of the posterior, keyed by parameter.
         exports: names of the folders, below the result folder, that `slipid export` wrote.
         has_robot: True if the folder has robot.json.
-        outdated: names of files of an earlier fit, which are left out.
+        outdated: names of files of a different fit or of other logs, which are left out.
     """
 
     folder: Path
@@ -100,18 +98,21 @@ def read_results(out: Path) -> Results:
         DataError: the folder has no result of `slipid identify`, or a file in it is damaged or
             belongs to another fit.
     """
+    fit = fit_of(out)
     identified = _content(out / IDENTIFIED, RESULT)
     run = _content(out / "run.json", RESULT)
     for key in ("parameters", "surfaces", "data", "messages"):
         if key not in identified:
             raise DataError(f"{out / IDENTIFIED}: no '{key}'; expected {RESULT}")
     evidence = read_evidence(out / EVIDENCE) if (out / EVIDENCE).exists() else None
+    if evidence is not None:
+        refuse_other_fit(out, out / EVIDENCE, evidence.fit)
     if evidence is not None and evidence.data_hash != identified["data"]["hash"]:
         raise DataError(
             f"{out / EVIDENCE}: of other logs than {IDENTIFIED} beside it; run `slipid identify` "
             "again"
         )
-    outdated = _outdated(out)
+    outdated = _outdated(out, fit, identified["data"]["hash"])
     return Results(
         folder=out,
         drive=_drive(out / "config.toml"),
@@ -120,7 +121,7 @@ def read_results(out: Path) -> Results:
         fit=_maybe(out / FIT),
         evidence=evidence,
         **{n: None if n in outdated else _maybe(out / f"{n}.json") for n in LATER},
-        draws=_draws(out / DRAWS) if (out / DRAWS).exists() and "sample" not in outdated else None,
+        draws=_draws(out) if (out / DRAWS).exists() and "sample" not in outdated else None,
         exports=tuple(sorted(p.parent.name for p in out.glob("*/SHA256SUMS"))),
         has_robot=(out / "robot.json").exists(),
         outdated=outdated,
@@ -140,12 +141,20 @@ def _content(path: Path, what: str) -> Content:
     return found
 
 
-def _outdated(out: Path) -> tuple[str, ...]:
-    """Return the names of later commands whose files are older than the fit."""
-    reference = out / (FIT if (out / FIT).exists() else IDENTIFIED)
-    paths = {name: out / f"{name}.json" for name in LATER}
-    since = reference.stat().st_mtime - COPIED_S
-    return tuple(n for n, path in paths.items() if path.exists() and path.stat().st_mtime < since)
+def _outdated(out: Path, fit: str | None, data_hash: object) -> tuple[str, ...]:
+    """Return the names of later commands whose files are of a different fit, or of other logs.
+
+    Files of older versions do not name their fit, and are kept.
+    """
+
+    def is_of_fit(name: str) -> bool:
+        found = _maybe(out / f"{name}.json") or {}
+        if name != "comparison":
+            return found.get("fit") in (None, fit)
+        of = found.get("data")  # a comparison is made from logs, without the fit
+        return not isinstance(of, dict) or of.get("hash") == data_hash
+
+    return tuple(name for name in LATER if not is_of_fit(name))
 
 
 def _maybe(path: Path) -> Content | None:
@@ -153,7 +162,7 @@ def _maybe(path: Path) -> Content | None:
     return _content(path, "the result of a command of slipid") if path.exists() else None
 
 
-def _draws(path: Path) -> dict[str, np.ndarray] | None:
+def _draws(out: Path) -> dict[str, np.ndarray] | None:
     """Return the draws of scalar parameters in posterior.nc, keyed by path, chain after chain.
 
     Returns:
@@ -163,9 +172,10 @@ def _draws(path: Path) -> dict[str, np.ndarray] | None:
         import h5py
     except ImportError:
         return None
-    found: dict[str, np.ndarray] = {}
+    path, found = out / DRAWS, dict[str, np.ndarray]()
     try:
         with h5py.File(path) as file:
+            refuse_other_fit(out, path, file.attrs.get("fit"))
             group: Any = file["posterior"]
             floors = [name.decode() for name in group["surface"][:]]
             for name, values in group.items():

@@ -1,0 +1,81 @@
+"""Result folder of `slipid identify`: its files are those of one fit.
+
+Every file that depends on a fit repeats the fit's checksum under the key `fit`, and commands that
+read several files compare them with `fit_of`. Before a fit is replaced, the files that depend on it
+are deleted, see `files_of_fit`; thus what a killed command leaves is incomplete, but never mixed.
+"""
+
+from pathlib import Path
+
+from slipid.support.errors import DataError
+from slipid.support.files import read_json
+
+FIT, IDENTIFIED, RUN, CONFIG, ROBOT = (
+    *("fit.json", "identified.json", "run.json", "config.toml", "robot.json"),
+)
+OF_FIT = (
+    *(RUN, IDENTIFIED, ROBOT, "evidence.json", "report.html"),
+    *("slip_by_heading.png", "slip_by_torque.png", "paths.png", "current_by_traction.png"),
+    *("load_share.png", "profile.json", "profile.png", "bench.png"),
+    *("motor_feedforward.h", "motor_feedforward.yaml"),
+    *("sample.json", "posterior.nc", "posterior_intervals.png", "posterior_pairs.png"),
+    *("validation.json", "validation_errors.png", "validation_paths.png"),
+    *("design.json", "design.png", "design_commands.csv", "trial.json", "trial.png"),
+)
+"""Names of the files in a result folder that depend on a fit, besides fit.json and its arrays."""
+_AGAIN = "run `slipid identify` again"
+
+
+def files_of_fit(folder: Path) -> list[Path]:
+    """Return the paths of the files that depend on the fit in a folder, present or not.
+
+    The copy of the config is not among them: it is replaced while run.json is absent.
+    """
+    return [folder / name for name in OF_FIT]
+
+
+def fit_of(folder: Path) -> str | None:
+    """Return the checksum of the fit in a folder, None if there is none or its files lack it.
+
+    For a calibration alone it is the checksum in identified.json. Files without a checksum, which
+    older versions wrote, are not compared.
+
+    Raises:
+        DataError: files in the folder are of different fits, or the writing of a fit was
+            interrupted; the message says what to do.
+    """
+    marks = {FIT: _under(folder / FIT, "checksum")}
+    marks |= {name: _under(folder / name, "fit") for name in (IDENTIFIED, RUN)}
+    known = {name: mark for name, mark in marks.items() if mark is not None}
+    first = next(iter(known), None)
+    for name, mark in known.items():
+        if mark != known[first or name]:
+            raise DataError(
+                f"{folder / name}: belongs to another fit than {first} in this folder; expected "
+                f"both from the same fit ({_AGAIN})"
+            )
+    if known and (folder / CONFIG).exists() and not (folder / RUN).exists():
+        raise DataError(
+            f"{folder / RUN}: missing, since the writing of a fit was interrupted; {_AGAIN}"
+        )
+    return None if first is None else str(known[first])
+
+
+def refuse_other_fit(folder: Path, path: Path, fit: object) -> None:
+    """Raise `DataError` if a file has the checksum of a fit, and it is not the one in the folder.
+
+    Args:
+        folder: the result folder.
+        path: the file.
+        fit: checksum in the file; None for a file of an older version, which has none.
+    """
+    if fit is not None and fit != fit_of(folder):
+        raise DataError(f"{path}: of another fit than the one in {folder}; {_AGAIN}")
+
+
+def _under(path: Path, key: str) -> object:
+    """Return what a JSON file has under a key, None if either is absent."""
+    if not path.exists():
+        return None
+    found = read_json(path, "the result of `slipid identify`")
+    return found.get(key) if isinstance(found, dict) else None
