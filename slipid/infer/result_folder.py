@@ -51,8 +51,8 @@ def fit_of(folder: Path) -> str | None:
     for name, mark in known.items():
         if mark != known[first or name]:
             raise DataError(
-                f"{folder / name}: belongs to another fit than {first} in this folder; expected "
-                f"both from the same fit ({_AGAIN})"
+                f"{folder / name}: belongs to a different fit than {first} in this folder; "
+                f"expected both from the same fit ({_AGAIN})"
             )
     if known and (folder / CONFIG).exists() and not (folder / RUN).exists():
         raise DataError(
@@ -70,7 +70,7 @@ def refuse_other_fit(folder: Path, path: Path, fit: object) -> None:
         fit: checksum in the file; None for a file of an older version, which has none.
     """
     if fit is not None and fit != fit_of(folder):
-        raise DataError(f"{path}: of another fit than the one in {folder}; {_AGAIN}")
+        raise DataError(f"{path}: of a different fit than the one in {folder}; {_AGAIN}")
 
 
 def _under(path: Path, key: str) -> object:

@@ -117,7 +117,7 @@ def whole(refits: Refits, sampled: Path, out: Path) -> None:
 def test_two_refits_and_a_killed_one_never_mix(refits, sampled, tmp_path, broken):
     first = tmp_path / "first"
     whole(refits, sampled[0], first)
-    with pytest.MonkeyPatch.context() as patch:  # a posterior of another fit is refused
+    with pytest.MonkeyPatch.context() as patch:  # a posterior of a different fit is refused
         patch.setattr("slipid.report.html.results._draws", lambda _: {"draws": np.zeros(1)})
         assert versions(first)["page"] == {BEFORE}
         rng = np.random.default_rng(0)
@@ -158,7 +158,7 @@ def test_every_file_of_a_result_is_known_to_depend_on_the_fit(small, sampled):
         assert names <= {*OF_FIT}
 
 
-def test_a_robot_or_a_posterior_of_another_result_is_refused(refits, sampled, tmp_path):
+def test_a_robot_or_a_posterior_of_a_different_result_is_refused(refits, sampled, tmp_path):
     for number in (FIRST, SECOND):
         refits.write(tmp_path / str(number), number)
     one, other = tmp_path / str(FIRST), tmp_path / str(SECOND)
@@ -169,7 +169,7 @@ def test_a_robot_or_a_posterior_of_another_result_is_refused(refits, sampled, tm
             read(one)
         (one / name).write_bytes(kept)
     shutil.copy(sampled[0] / "posterior.nc", one)
-    with pytest.raises(DataError, match=r"posterior\.nc: of another fit"):
+    with pytest.raises(DataError, match=r"posterior\.nc: of a different fit"):
         read_results(one)
 
 

@@ -500,13 +500,13 @@ def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(tmp_pat
     assert (found[0], found[-1], len(found)) == (OLD, new.remaining, 9)
 
 
-def test_a_file_of_another_fit_is_noticed(tmp_path):
+def test_a_file_of_a_different_fit_is_noticed(tmp_path):
     old, new = of_two()
     names = save(old, tmp_path / "old"), save(new, tmp_path / "new")
     for mine, other in zip(*names, strict=True):
         kept = (tmp_path / "new" / other).read_bytes()
         (tmp_path / "new" / other).write_bytes((tmp_path / "old" / mine).read_bytes())
-        with pytest.raises(DataError, match=r"another fit|damaged|expected the arrays of"):
+        with pytest.raises(DataError, match=r"a different fit|damaged|expected the arrays of"):
             load(tmp_path / "new")
         (tmp_path / "new" / other).write_bytes(kept)
     assert load(tmp_path / "new").remaining == new.remaining

@@ -278,7 +278,7 @@ def test_a_robot_is_not_compared_with_itself(folder):
     assert "warthog" in robots
 
 
-def test_results_of_another_fit_are_left_out_whatever_their_times(folder):
+def test_results_of_a_different_fit_are_left_out_whatever_their_times(folder):
     for name, mark in (("identified", "fit 2"), ("run", "fit 2"), ("trial", "fit 1")):
         path = folder / f"{name}.json"
         content = json.loads(path.read_text()) if path.exists() else {}
@@ -292,14 +292,14 @@ def test_results_of_another_fit_are_left_out_whatever_their_times(folder):
     assert found.outdated == ("comparison", "trial")
     assert (found.trial, found.comparison, found.design is None) == (None, None, False)
     shown = words(page_of(folder)["data"])
-    assert "Left out, as of another fit: comparison.json and trial.json" in shown
+    assert "Left out, as of a different fit: comparison.json and trial.json" in shown
 
 
 def test_a_folder_with_files_of_two_fits_is_refused_with_what_to_do(folder):
     for name, mark in (("identified", "fit 2"), ("run", "fit 1")):
         path = folder / f"{name}.json"
         path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": mark}))
-    with pytest.raises(DataError, match=r"run\.json: belongs to another fit than .*again\)"):
+    with pytest.raises(DataError, match=r"run\.json: belongs to a different fit than .*again\)"):
         read_results(folder)
     (folder / "run.json").unlink()
     with pytest.raises(DataError, match=r"run\.json: missing, since .* interrupted; run `slipid"):

@@ -33,6 +33,15 @@ def test_what_is_kept_comes_back(kept):
     assert kept.load_json("part") == PLAIN
 
 
+@pytest.mark.parametrize("time_s", [0.0, 4e9])
+def test_times_of_files_mean_nothing(kept, time_s):
+    """The clock may have been set back, or forward."""
+    for suffix in ("npz", "json"):
+        os.utime(kept.folder / f"part.{suffix}", (time_s, time_s))
+    assert kept.load("part") is not None
+    assert kept.load_json("part") == PLAIN
+
+
 def test_parts_of_other_work_are_absent(kept):
     other = Checkpoint(kept.folder, "other")
     assert other.load("part") is None

@@ -112,5 +112,21 @@ def test_names_that_no_json_can_have_are_refused_before_the_work(name, tmp_path,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_without_a_home_and_its_cache_commands_compute_and_draw(tmp_path):
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from slipid.support.jax_setup import setup_jax; setup_jax(quiet=True)\n"
+        "import jax; assert float(jax.jit(lambda x: x + 1)(1.0)) == 2.0\n"
+        "from slipid.plots import drawing\n"
+        "drawing.save(drawing.figure(2.0, 2.0, 'empty'), Path(sys.argv[1]))\n"
+    )
+    gone = ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "JAX_COMPILATION_CACHE_DIR", "SLIPID_CACHE")
+    kept = {k: v for k, v in os.environ.items() if k not in (*gone, "MPLCONFIGDIR")}
+    nowhere = dict.fromkeys(("HOME", "TMPDIR"), "/dev/null/nowhere")
+    words = [sys.executable, "-c", code, tmp_path / "empty.png"]
+    subprocess.run(words, env=kept | nowhere, check=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["empty.png"]
+
+
 def test_a_possible_name_is_its_own_target(tmp_path):
     assert target_of(tmp_path / "new" / "a.json") == (tmp_path / "new" / "a.json").resolve()

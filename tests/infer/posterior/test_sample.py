@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
+from xarray import DataTree, open_datatree
 
 from slipid.fitting.hierarchy import POOLED_RANGE, pooled_stds, stds_given
 from slipid.fitting.problem import Problem
 from slipid.infer.posterior.blocks import ChainBlock
-from slipid.infer.posterior.sample import thinned
+from slipid.infer.posterior.sample import thinned, write
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -28,6 +30,18 @@ FREE = [
 def problem():
     truth = robot()
     return Problem(replace(made(truth, std=STD), has_voltage=False), truth, FREE)
+
+
+def test_a_posterior_needs_no_room_where_the_system_has_temporary_files(tmp_path, monkeypatch):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    for name in ("mkdtemp", "mkstemp", "gettempdir"):
+        monkeypatch.setattr(tempfile, name, full)
+    write(DataTree.from_dict({"posterior/x": ("draw", np.arange(3.0))}), tmp_path / "posterior.nc")
+    assert [p.name for p in tmp_path.iterdir()] == ["posterior.nc"]
+    with open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as tree:
+        assert tree["posterior"]["x"].values.tolist() == [0.0, 1.0, 2.0]
 
 
 def test_the_std_of_load_biases_has_the_posterior_that_its_likelihood_gives(problem):

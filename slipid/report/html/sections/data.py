@@ -117,7 +117,7 @@ def quality(found: Results) -> PageSection:
         names = enumerated([f"{name}.json" for name in found.outdated])
         blocks.append(
             TextBlock(
-                [f"Left out, as of another fit: {names}. Run its command again."], kind="note"
+                [f"Left out, as of a different fit: {names}. Run its command again."], kind="note"
             )
         )
     if more := ranked_notes(found)[MOST_NOTES:]:
