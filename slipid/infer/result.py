@@ -326,7 +326,10 @@ class Fit:
         return deploy(self)
 
     def save(self, folder: Path | str) -> None:
-        """Write fit.json, its arrays and identified.json, each completely or not at all."""
+        """Write fit.json, its arrays and identified.json, each completely or not at all.
+
+        If the folder has a fit, the files that depend on it, such as robot.json, are deleted.
+        """
         from slipid.infer import fit_file
 
         fit_file.save(self, Path(folder))

@@ -14,23 +14,29 @@ FIT, IDENTIFIED, RUN, CONFIG, ROBOT = (
     *("fit.json", "identified.json", "run.json", "config.toml", "robot.json"),
 )
 OF_FIT = (
-    *(RUN, IDENTIFIED, ROBOT, "evidence.json", "report.html"),
+    *(RUN, ROBOT, "evidence.json", "report.html"),
     *("slip_by_heading.png", "slip_by_torque.png", "paths.png", "current_by_traction.png"),
     *("load_share.png", "profile.json", "profile.png", "bench.png"),
     *("motor_feedforward.h", "motor_feedforward.yaml"),
     *("sample.json", "posterior.nc", "posterior_intervals.png", "posterior_pairs.png"),
     *("validation.json", "validation_errors.png", "validation_paths.png"),
     *("design.json", "design.png", "design_commands.csv", "trial.json", "trial.png"),
+    IDENTIFIED,
 )
-"""Names of the files in a result folder that depend on a fit, besides fit.json and its arrays."""
+"""Names of the files in a result folder that depend on a fit, besides fit.json and its arrays.
+
+They are deleted in this order. The last one shows that the folder has a result."""
 _AGAIN = "run `slipid identify` again"
 
 
 def files_of_fit(folder: Path) -> list[Path]:
     """Return the paths of the files that depend on the fit in a folder, present or not.
 
-    The copy of the config is not among them: it is replaced while run.json is absent.
+    The copy of the config is not among them: it is replaced while run.json is absent. A folder
+    without a fit has none: a robot.json in it is not slipid's to delete.
     """
+    if not any((folder / name).exists() for name in (FIT, IDENTIFIED)):
+        return []
     return [folder / name for name in OF_FIT]
 
 
