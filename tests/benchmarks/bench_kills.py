@@ -112,7 +112,7 @@ def numbers_of(value: object, where: str = "") -> dict[str, object]:
 
 def content(path: Path) -> dict[str, object]:
     if path.suffix == ".csv":
-        rows = list(csv.reader(path.open()))
+        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
         return {f"{n}/{k}": cell for n, row in enumerate(rows) for k, cell in enumerate(row)}
     if path.suffix == ".nc":
         with xarray.open_datatree(path, engine="h5netcdf") as tree:
