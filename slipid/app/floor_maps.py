@@ -1,5 +1,6 @@
 """Floor maps that a config names, and their copies in a folder of results."""
 
+import os
 from pathlib import Path
 
 from slipid.app.config import Config, LogsSection
@@ -21,7 +22,8 @@ def map_path(config: Config, section: LogsSection) -> Path | None:
         return None
     named = config.path.parent / section.map
     copied = config.path.parent / COPIES / named.name
-    return copied if copied.is_file() and (config.path.parent / "run.json").is_file() else named
+    of_results = (config.path.parent / "run.json").is_file()
+    return copied if of_results and os.path.isfile(copied) else named
 
 
 def map_files(config: Config) -> dict[str, Path]:
@@ -32,7 +34,7 @@ def map_files(config: Config) -> dict[str, Path]:
     """
     out: dict[str, Path] = {}
     for path in (map_path(config, section) for section in config.content.logs):
-        if path is None or not path.is_file():
+        if path is None or not os.path.isfile(path):
             continue
         for file in filter(None, (path, picture_of(path))):
             other = out.setdefault(file.name, file)

@@ -3,6 +3,7 @@
 A map is made from polygons, from a picture, from a map file or at random.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -232,13 +233,13 @@ def picture_of(path: Path) -> Path | None:
         return None
     named = mapping_of(path, text_of(path, "a floor map")).get("picture")
     found = _beside(path, named) if isinstance(named, str) else path.parent
-    return found if found.is_file() else None
+    return found if os.path.isfile(found) else None
 
 
 def _beside(path: Path, picture: str) -> Path:
     """Return the path of a map's picture; a copied map has a copy of its picture beside it."""
     named = path.parent / picture
-    return named if named.is_file() else path.parent / named.name
+    return named if os.path.isfile(named) else path.parent / named.name
 
 
 def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:

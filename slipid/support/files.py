@@ -148,8 +148,11 @@ def read_bytes(path: Path, what: str, most: int = 256 * 2**20) -> bytes:
         if kept.st_size > most:
             raise DataError(f"{path}: {kept.st_size} bytes; expected {what}, at most {most} bytes")
         return path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected {what}") from error
+    except DataError:
+        raise
+    except (OSError, ValueError) as error:  # a null character in a path is a ValueError
+        reason = getattr(error, "strerror", None) or str(error)
+        raise DataError(f"{path}: {reason}; expected {what}") from error
 
 
 def read_json(path: Path, what: str) -> Any:

@@ -30,6 +30,8 @@ MOST_SECONDS = 2.0
 MOST_MB = 2048.0
 """Memory of a read beyond what the process had before."""
 PACKAGE = Path(__file__).resolve().parents[2] / "slipid"
+_OF_NAMED_FILES = ("No such file", "File name too long", "null byte")
+"""Errors about files that the input names, which the messages then name in its place."""
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _CHANGES = (
     "os.mkdir",
@@ -176,7 +178,7 @@ def _refused(door: Door, error: DataError, specimen: Files) -> Verdict:
         start = f"{len(message)} characters: {message[:200]}"
         return Verdict("long", "DataError", *place, start)
     known = {part for name in specimen for part in Path(name).parts}
-    if not any(word in message for word in (*known, *door.mentions)):
+    if not any(word in message for word in (*known, *door.mentions, *_OF_NAMED_FILES)):
         return Verdict("nameless", "DataError", *place, message[:200])
     return Verdict("refused", message=message)
 

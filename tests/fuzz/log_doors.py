@@ -45,6 +45,7 @@ BAG = {
         "gyro": {"topic": "/imu"},
     },
 }
+RUNS = {"table": "runs.csv", "from_start": True}
 ULOG = {
     "kind": "bag",
     "topics": {
@@ -151,6 +152,12 @@ def _loose(suffix: str, storage: str, folder: Path) -> None:
     shutil.rmtree(whole)
 
 
+def _with_runs(folder: Path) -> None:
+    _bag_of("rosbag1", None, folder)
+    rows = ["start,end,surface,load,name,bag", "0.0,0.4,wood,own,a,bag.bag", "0.5,0.9,felt,,b,"]
+    (folder / "runs.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
 def _ulog(folder: Path) -> None:
     formats = {"wheel_encoders": "uint64_t timestamp;float[2] wheel_speed;float[2] wheel_angle;"}
     messages = [
@@ -224,8 +231,10 @@ _ROWS = tuple(n for n in _MOTORS if n.endswith(".csv") and n not in _SCOPES)
 _COLUMNS = {"voltage": "U", "current": "I:A", "motor_speed": "w:rad/s", "time": "t:s"}
 
 
-def _bag_door(name: str, make: Callable[[Path], None], **more: Any) -> Door:
-    return Door(name, make, partial(_bag, BAG), mentions=("bag",), weight=0.5, **more)
+def _bag_door(
+    name: str, make: Callable[[Path], None], layout: dict[str, Any] = BAG, **more: Any
+) -> Door:
+    return Door(name, make, partial(_bag, layout), mentions=("bag",), weight=0.5, **more)
 
 
 def _layout_door(name: str, layout: dict[str, Any], make: Callable[[Path], None]) -> Door:
@@ -259,6 +268,8 @@ DOORS = (
     _layout_door("layout_robotino", ROBOTINO | {"columns": {}, "tick_bits": 16}, _robotino),
     _layout_door("layout_two_files", TWO_FILES, _with_poses),
     _layout_door("layout_bag", BAG | {"runs": {"pause_s": 0.3}}, partial(_bag_of, "mcap", None)),
+    _layout_door("layout_bag_runs", BAG | {"runs": RUNS}, _with_runs),
+    _bag_door("bag_runs", _with_runs, targets=("runs.csv",), layout=BAG | {"runs": RUNS}),
     Door("motor_rows", partial(_motors, _ROWS), _motor, _ROWS),
     Door("motor_oscilloscope", partial(_motors, _SCOPES), _motor, _SCOPES),
     Door("motor_json", partial(_motors, _MOTORS), _motor, ("sysid.json", "old.json")),
@@ -271,5 +282,5 @@ DOORS = (
         mentions=("plain.csv", "--"),
     ),
     Door("end_poses", _end_poses, _end_coordinates),
-    Door("packaged_logs", _archive, _unpacked),
+    Door("packaged_logs", _archive, _unpacked, mentions=("cannot be written",)),
 )

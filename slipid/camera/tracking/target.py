@@ -190,7 +190,10 @@ def _target(given: _Target, where: str) -> Target:
     markers += [marker for board in given.board for marker in board.markers()]
     if not markers:
         raise DataError(f"{where}: no marker; expected [[target.marker]] or [[target.board]]")
-    most = marker_count(given.dictionary)
+    try:
+        most = marker_count(given.dictionary)
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
     for marker in markers:
         if marker.id >= most:
             raise DataError(

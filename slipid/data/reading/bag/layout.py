@@ -1,5 +1,6 @@
 """Layout of a bag: the topic of each channel, and the rule that separates the bag's runs."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -198,6 +199,6 @@ def _problem(layout: BagLayout) -> str | None:
         return f"joints {list(layout.joints)}; expected each name only once"
     if layout.runs is not None and layout.runs.pause_s is not None and not have & set(TURNS):
         return f"pause_s without a channel of the wheels; expected one of {', '.join(TURNS)}"
-    if layout.definitions is not None and not layout.definitions.is_dir():
+    if layout.definitions is not None and not os.path.isdir(layout.definitions):
         return f"definitions: no folder {layout.definitions}; expected a folder with .msg files"
     return None

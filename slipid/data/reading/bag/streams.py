@@ -43,7 +43,7 @@ def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
     """
     parents = shape.texts("transforms.header.frame_id")
     children = shape.texts("transforms.child_frame_id")
-    pairs = zip(parents, children, strict=True)
+    pairs = zip(parents, children, strict=False)  # a damaged definition may lack one of both
     return tuple(Edge(parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
 
 
