@@ -72,6 +72,8 @@ _NEAR = 0.82
 """Least similarity (`difflib`) for which a word counts as a misspelling of a known one [1]."""
 _LETTERS = 3
 """Words up to this length, such as wl, may be read as a sequence of one-letter words."""
+_LONGEST = 60
+"""Letters of the longest word that is looked up; the time of a search grows with their square."""
 _SUFFIXES = {
     **{"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us"},
     **{"usec": "us", "ns": "ns", "nsec": "ns", "m": "m", "mm": "mm", "cm": "cm"},
@@ -243,6 +245,9 @@ def name_parts(name: str) -> NameParts:
     for part in _split(name):
         if part.isdecimal():
             numbers.append(part)
+            continue
+        if len(part) > _LONGEST:
+            unknown.append(part)
             continue
         for word in [part] if part in _ROLES else _apart(part):
             near = [word] if word in _ROLES else []
