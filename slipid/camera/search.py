@@ -84,6 +84,9 @@ def visible_markers(pictures: Sequence[np.ndarray], tell: Tell = silent) -> Visi
     numbers: dict[tuple[str, bool], set[int]] = {}
     exact = cv2.aruco.DetectorParameters()
     exact.errorCorrectionRate = 0.0  # with corrected bits, markers of other dictionaries would fit
+    # only whole patches: noise inside of them has many small squares
+    longest = max((max(one.shape) for one in sheets), default=1)
+    exact.minMarkerPerimeterRate = 2.5 * PATCH / longest
     families = _families()
     for done, members in enumerate(families):
         tell(done, len(families))

@@ -1,6 +1,7 @@
 """Figures of a camera calibration: coverage by corners, and residuals of points on the floor."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,8 @@ from slipid.plots.drawing import BLUE, GREEN, INK, ORANGE, figure, save
 ARROW_LENGTH = 0.06
 """Largest length at which the 95 % quantile of residuals is drawn, as a fraction of the image
 width."""
-UP = "offset points"
+CELL_NUMBER: dict[str, Any] = {"xytext": (4, -4), "textcoords": "offset points", "color": "#777777"}
+"""Style of the numbers of the image's columns and rows of cells."""
 GRID_STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
 """Possible distances between grid lines drawn on the floor [m]."""
 
@@ -44,9 +46,9 @@ def coverage_picture(
     if not covered.visited.all():
         axes.add_patch(Rectangle((0, 0), 0, 0, fc=ORANGE, alpha=0.18, label="never visited"))
     for k in range(across):
-        axes.annotate(f"{k + 1}", ((k + 0.5) * size[0], 0), (0, 3), textcoords=UP, ha="center")
+        axes.annotate(f"{k + 1}", ((k + 0.5) * size[0], 0), **CELL_NUMBER, ha="center", va="top")
     for k in range(down):
-        axes.annotate(f"{k + 1}", (width, (k + 0.5) * size[1]), (4, 0), textcoords=UP, va="center")
+        axes.annotate(f"{k + 1}", (0, (k + 0.5) * size[1]), **CELL_NUMBER, ha="left", va="center")
     axes.set_xticks(np.arange(across + 1) * size[0] - 0.5, minor=True)
     axes.set_yticks(np.arange(down + 1) * size[1] - 0.5, minor=True)
     axes.grid(which="minor", color="#dddddd", lw=0.6)
