@@ -14,6 +14,7 @@ from slipid.search_space import Choice
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json
+from slipid.support.quantities import Bounds
 
 SCHEMA = "slipid.identified/1"
 COPY_NAME = "motor_bench.json"
@@ -31,6 +32,7 @@ WEAK_STD = 0.1
 """Least std of the logarithm of a weak number: a misfit may be larger than its interval [1]."""
 KNOWN = ("identified", "weak")
 """Verdicts with which a parameter is taken from a bench."""
+_SIZE = Bounds(-1e12, 1e12)
 _EXPECTED = "the identified.json that `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
@@ -89,7 +91,7 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
         return [], []
     path, found = bench
     taken = _taken(found)
-    declared = {e.path: e.declaration for e in entries(Motor())}
+    declared = _declared()
     choices = []
     for name, numbers in taken.items():
         power = {"coulomb_friction": 1, "viscous_friction": 2}.get(name, 0)
@@ -106,6 +108,11 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
     if left_out := [name for name in NAMES if name not in taken]:
         lines.append(f"not taken from {path}, since not identified there: {', '.join(left_out)}")
     return choices, lines
+
+
+def _declared() -> dict[str, Declaration]:
+    """Return the declaration of each parameter of a robot's motor, keyed by name."""
+    return {e.path: e.declaration for e in entries(Motor())}
 
 
 def _taken(found: FoundNumbers) -> FoundNumbers:
@@ -166,30 +173,38 @@ def _read(path: Path, where: str) -> FoundNumbers:
         )
         raise DataError(f"{where}: {path}: {what}; expected {_EXPECTED}")
     found: FoundNumbers = {}
+    declared, at = _declared(), ""
     try:
         for full, number in content["parameters"].items():
             name = full.partition("@")[0].removeprefix("motor.")
             if name in NAMES:
-                found.setdefault(name, []).append(_number(full, number))
+                at = full
+                found.setdefault(name, []).append(_number(number, declared[name]))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{where}: {path}: damaged ({error}); expected {_EXPECTED}") from error
+        damage = f"{at}: {error}" if at else f"{error}"
+        raise DataError(f"{where}: {path}: damaged ({damage}); expected {_EXPECTED}") from error
     return found
 
 
-def _number(full: str, number: Content) -> _Found:
+def _number(number: Content, declared: Declaration) -> _Found:
     """Return a parameter from its entry in a bench file.
+
+    Args:
+        number: the entry.
+        declared: declaration of the parameter of a robot's motor.
 
     Raises:
         KeyError, TypeError, ValueError: the entry is damaged.
     """
     verdict, ends = number["verdict"], number["interval90"]
+    value = _SIZE.checked(number["value"])
     if verdict in KNOWN and ends is None:
-        raise ValueError(f"{full}: no interval")
+        raise ValueError("no interval")
     if ends is None:
-        return _Found(float(number["value"]), None, verdict)
-    low, high = map(float, ends)
-    if 0 < low < high:
-        return _Found(float(number["value"]), (low, high), verdict)
+        return _Found(value, None, verdict)
+    low, high = map(_SIZE.checked, ends)
+    if 0 < low < high < declared.upper:
+        return _Found(value, (low, high), verdict)
     if verdict in KNOWN:
-        raise ValueError(f"{full}: interval from {low} to {high}")
-    return _Found(float(number["value"]), None, verdict)
+        raise ValueError(f"interval from {low} to {high}")
+    return _Found(value, None, verdict)

@@ -17,11 +17,28 @@ from slipid.infer.bench.rows import Between
 from slipid.model import geometry as g
 from slipid.model.geometry import Geometry
 from slipid.support.errors import DataError
+from slipid.support.quantities import (
+    Bounds,
+    Coordinate,
+    Degrees,
+    GearRatio,
+    InsidePath,
+    Length,
+    Mass,
+    Number,
+    PathText,
+    Positive,
+    Seconds,
+    Seed,
+    Speed,
+)
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
 Numbers = Number | list[Number]
+Place = Annotated[float, Bounds(-1e3, 1e3, "m")]
+"""Coordinate of a place on a robot, from the middle of the robot [m]."""
+MOST_WHEELS = 100
+"""Largest number of wheels of one robot."""
 
 
 class LimitsSection(Section):
@@ -37,11 +54,11 @@ class LimitsSection(Section):
         voltage_v: voltage of the supply.
     """
 
-    speed_m_s: Annotated[float, Field(gt=0, le=50)] | None = None
-    yaw_rate_rad_s: Annotated[float, Field(gt=0, le=50)] | None = None
-    acceleration_m_s2: Annotated[float, Field(gt=0, le=100)] | None = None
-    wheel_speed_rad_s: Annotated[float, Field(gt=0, le=1000)] | None = None
-    voltage_v: Annotated[float, Field(gt=0, le=1000)] | None = None
+    speed_m_s: Annotated[float, Bounds(1e-4, 50, "m/s")] | None = None
+    yaw_rate_rad_s: Annotated[float, Bounds(1e-4, 50, "rad/s")] | None = None
+    acceleration_m_s2: Annotated[float, Bounds(1e-4, 100, "m/s^2")] | None = None
+    wheel_speed_rad_s: Annotated[float, Bounds(1e-3, 1e3, "rad/s")] | None = None
+    voltage_v: Annotated[float, Bounds(0.1, 1e3, "V")] | None = None
 
 
 class SensorsSection(Section):
@@ -57,11 +74,11 @@ class SensorsSection(Section):
         stale_s: time without readings after which the estimator calls a wheel stale.
     """
 
-    ammeter_std_a: Annotated[float, Field(gt=0, le=100)] | None = None
-    voltmeter_std_v: Annotated[float, Field(gt=0, le=100)] | None = None
-    gyro_std_rad_s: Annotated[float, Field(gt=0, le=10)] | None = None
-    gyro_bias_std_rad_s: Annotated[float, Field(gt=0, le=10)] | None = None
-    stale_s: Annotated[float, Field(gt=0, le=60)] | None = None
+    ammeter_std_a: Annotated[float, Bounds(1e-6, 100, "A")] | None = None
+    voltmeter_std_v: Annotated[float, Bounds(1e-6, 100, "V")] | None = None
+    gyro_std_rad_s: Annotated[float, Bounds(1e-8, 10, "rad/s")] | None = None
+    gyro_bias_std_rad_s: Annotated[float, Bounds(1e-8, 10, "rad/s")] | None = None
+    stale_s: Annotated[float, Bounds(1e-3, 60, "s")] | None = None
 
 
 class ActuatorsSection(Section):
@@ -72,8 +89,8 @@ class ActuatorsSection(Section):
         lag_s: time constant with which the wheels then follow the command.
     """
 
-    delay_s: Annotated[float, Field(ge=0, le=5)] | None = None
-    lag_s: Annotated[float, Field(ge=0, le=5)] | None = None
+    delay_s: Annotated[float, Bounds(0, 5, "s")] | None = None
+    lag_s: Annotated[float, Bounds(0, 5, "s")] | None = None
 
 
 class WheeledDrive(Section):
@@ -95,11 +112,11 @@ class WheeledDrive(Section):
         actuators: response of the wheels to commands.
     """
 
-    wheel_radius_m: Positive
-    gear_ratio: Positive = 1.0
-    mass_kg: Positive | None = None
+    wheel_radius_m: Length
+    gear_ratio: GearRatio = 1.0
+    mass_kg: Mass | None = None
     drives: list[Annotated[list[int], Field(min_length=1)]] | None = None
-    motor: str | None = None
+    motor: PathText | None = None
     limits: LimitsSection = LimitsSection()
     sensors: SensorsSection = SensorsSection()
     actuators: ActuatorsSection = ActuatorsSection()
@@ -131,9 +148,9 @@ class OmniDrive(WheeledDrive):
     """
 
     drive: Literal["omni"]
-    base_radius_m: Positive
-    wheel_azimuths_deg: list[Number] = Field(min_length=3)
-    roller_angle_deg: Number = 90.0
+    base_radius_m: Length
+    wheel_azimuths_deg: list[Degrees] = Field(min_length=3, max_length=MOST_WHEELS)
+    roller_angle_deg: Degrees = 90.0
 
 
 class FourWheelDrive(WheeledDrive):
@@ -148,8 +165,8 @@ class FourWheelDrive(WheeledDrive):
     """
 
     drive: Literal["mecanum", "skid"]
-    half_length_m: Positive
-    half_width_m: Positive
+    half_length_m: Length
+    half_width_m: Length
 
 
 class DifferentialDrive(WheeledDrive):
@@ -160,7 +177,7 @@ class DifferentialDrive(WheeledDrive):
     """
 
     drive: Literal["differential"]
-    track_m: Positive
+    track_m: Length
 
 
 class SteeredDrive(WheeledDrive):
@@ -176,7 +193,7 @@ class SteeredDrive(WheeledDrive):
     """
 
     drive: Literal["steered"]
-    wheelbase_m: Positive
+    wheelbase_m: Length
     driven: Literal["rear", "front"] = "rear"
     encoders: Literal[1, 2] = 1
 
@@ -200,11 +217,11 @@ class GeneralDrive(WheeledDrive):
     """
 
     drive: Literal["general"]
-    wheel_places_m: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = Field(
-        min_length=2
+    wheel_places_m: list[Annotated[list[Place], Field(min_length=2, max_length=2)]] = Field(
+        min_length=2, max_length=MOST_WHEELS
     )
-    drive_directions_deg: list[Number]
-    roller_angles_deg: list[Number | Literal["none"]]
+    drive_directions_deg: list[Degrees]
+    roller_angles_deg: list[Degrees | Literal["none"]]
 
     @model_validator(mode="after")
     def _one_per_wheel(self) -> "GeneralDrive":
@@ -256,15 +273,15 @@ class LogsSection(Section):
             calibrate the kinematics alone.
     """
 
-    glob: str
+    glob: InsidePath
     format: str
     surface: str = "folder"
-    map: str | None = None
+    map: PathText | None = None
     load: str = "as_built"
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
     session_name: str | None = Field(default=None, min_length=1)
-    min_rows: int = Field(default=2, ge=2)
-    end_poses: str | None = None
+    min_rows: Annotated[int, Bounds(2, 1e9)] = 2
+    end_poses: InsidePath | None = None
 
     @model_validator(mode="after")
     def _one_floor_or_many(self) -> "LogsSection":
@@ -283,7 +300,7 @@ class CameraSection(Section):
             errors due to tilt and distortion are zero.
     """
 
-    image_centre_m: tuple[Number, Number] = (0.0, 0.0)
+    image_centre_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
 
 
 class PriorSection(Section):
@@ -337,11 +354,11 @@ class WeightsSection(Section):
         place_m: x (ahead) and y (left) of that mass, measured from the middle of the robot.
     """
 
-    std_kg: Positive
-    kg: list[Positive] | None = None
+    std_kg: Mass
+    kg: list[Mass] | None = None
     like: str | None = None
-    mass_kg: Number | None = None
-    place_m: tuple[Number, Number] | None = None
+    mass_kg: Annotated[float, Bounds(-1e7, 1e7, "kg")] | None = None
+    place_m: tuple[Place, Place] | None = None
 
     @model_validator(mode="after")
     def _one_way(self) -> "WeightsSection":
@@ -383,12 +400,12 @@ class FitSection(Section):
     """
 
     lengths_from: Literal["poses", "wheels"] | None = None
-    windows_per_piece: int = Field(default=4, ge=1, le=32)
-    longest_window_s: Positive | None = None
-    rounds: int = Field(default=30, ge=1)
-    tolerance: Positive = 0.02
+    windows_per_piece: Annotated[int, Bounds(1, 32)] = 4
+    longest_window_s: Seconds | None = None
+    rounds: Annotated[int, Bounds(1, 10_000)] = 30
+    tolerance: Annotated[float, Bounds(1e-6, 10)] = 0.02
     intervals: Literal["sampled", "laplace"] = "sampled"
-    seed: int = Field(default=0, ge=0)
+    seed: Seed = 0
 
 
 class ValidateSection(Section):
@@ -416,10 +433,10 @@ class SelftestSection(Section):
     """
 
     surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
-    headings: int = Field(default=12, ge=1, le=360)
-    speeds_m_s: list[Positive] = Field(default=[0.1, 0.2], min_length=1)
-    turns: int = Field(default=2, ge=0)
-    distance_m: Positive = 0.7
+    headings: Annotated[int, Bounds(1, 360)] = 12
+    speeds_m_s: list[Speed] = Field(default=[0.1, 0.2], min_length=1)
+    turns: Annotated[int, Bounds(0, 1000)] = 2
+    distance_m: Annotated[float, Bounds(1e-3, 1e4, "m")] = 0.7
     truth: dict[str, Numbers] = Field(default_factory=dict)
     wanted: list[str] | None = None
 

@@ -14,7 +14,14 @@ from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.end_poses import EndPoses, read_end_poses, refuse_unused
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
-from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of, without_beside
+from slipid.data.reading.reader import (
+    AnyLayout,
+    find_logs,
+    matching,
+    read_logs,
+    session_of,
+    without_beside,
+)
 from slipid.data.runs import Runs, collect, counted_once
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
@@ -173,7 +180,7 @@ def matching_files(
     rest = _files(root, glob, "--logs")
     out = []
     for section in sections:
-        mine = set(root.glob(section.glob))
+        mine = set(matching(root, section.glob))
         out.append((section, [path for path in rest if path in mine]))
         rest = [path for path in rest if path not in mine]
     if rest:
@@ -202,8 +209,7 @@ def _files(root: Path, glob: str, where: str) -> list[Path]:
     """Return the files that match a glob; `where` names the place of the glob in errors."""
     try:
         return find_logs(root, glob)
-    # pathlib raises `NotImplementedError` for absolute globs
-    except (ValueError, NotImplementedError) as error:
+    except DataError as error:
         raise DataError(f"{where} '{glob}': {error}") from error
 
 

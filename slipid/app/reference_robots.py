@@ -19,7 +19,8 @@ from slipid.app.logs import packaged_path
 from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import read_json
-from slipid.support.toml_file import CLOSED, NotNegative, checked
+from slipid.support.quantities import NotNegative
+from slipid.support.toml_file import CLOSED, checked
 
 SCHEMA = "slipid.reference/1"
 ERROR = "trust.held_out_error_over_path"

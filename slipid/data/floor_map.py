@@ -12,16 +12,19 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
-from pydantic import Field, FiniteFloat
+from pydantic import Field
 
 from slipid.support.errors import DataError
 from slipid.support.extras import require
 from slipid.support.files import write_bytes
+from slipid.support.quantities import CellLength, Coordinate, InsidePath
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
 SCHEMA = "slipid.map/1"
-Point = tuple[FiniteFloat, FiniteFloat]
+Point = tuple[Coordinate, Coordinate]
 """Coordinates x, y [m]."""
+Extent = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+"""Lowest x, lowest y, highest x and highest y [m]."""
 Colour = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
 MOST_CELLS = 16_000_000
 """Largest number of cells of one map."""
@@ -181,8 +184,8 @@ class PatchedFile(Section):
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
     base: str
-    extent_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-    cell_m: float = Field(0.005, gt=0, le=1)
+    extent_m: Extent
+    cell_m: CellLength = 0.005
     patch: list[PatchTable] = Field(default_factory=list)
 
 
@@ -190,9 +193,9 @@ class PicturedFile(Section):
     """Map file with a picture of the floor from above, whose lower left corner is at `corner_m`."""
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
-    picture: str
+    picture: InsidePath
     colours: dict[str, Colour] = Field(min_length=1)
-    metres_per_pixel: float = Field(ge=1e-5, le=1)
+    metres_per_pixel: CellLength
     corner_m: Point = (0.0, 0.0)
 
 

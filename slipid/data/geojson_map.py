@@ -10,18 +10,19 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
-from pydantic import Field, FiniteFloat
+from pydantic import Field
 
-from slipid.data.floor_map import MOST_CELLS, Colour, FloorMap
+from slipid.data.floor_map import MOST_CELLS, Colour, Extent, FloorMap
 from slipid.support.content import Content
 from slipid.support.errors import bad_data
 from slipid.support.files import read_json, write_json
+from slipid.support.quantities import Bounds, CellLength, Coordinate, Number
 from slipid.support.toml_file import Section, checked
 
 EXPECTED = "a floor map (slipid.map/2) that `slipid map` wrote"
 DIGITS = 5
 """Decimal places of the written coordinates [m]: they are rounded to 0.01 mm."""
-Place = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
+Place = Annotated[list[Coordinate], Field(min_length=2, max_length=2)]
 Ring = Annotated[list[Place], Field(min_length=4)]
 
 
@@ -59,12 +60,12 @@ class MapRegion(Section):
     """
 
     schema_: Literal["slipid.map/2"] = Field(default="slipid.map/2", alias="schema")
-    extent_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-    cell_m: float = Field(gt=0, le=1)
+    extent_m: Extent
+    cell_m: CellLength
     base: str
     colours: dict[str, Colour] = Field(min_length=1)
     picture_sha256: str
-    unknown_share: float = Field(ge=0, le=1)
+    unknown_share: Annotated[float, Bounds(0, 1)]
     notes: list[str]
 
 
@@ -107,9 +108,9 @@ class _Geometry(Section):
 
 class _Properties(Section):
     surface: str
-    area_m2: float = Field(ge=0, allow_inf_nan=False)
+    area_m2: Annotated[float, Bounds(0, 1e16, "m^2")]
     colour: Colour
-    confidence: FiniteFloat | None
+    confidence: Number | None
 
 
 class _Feature(Section):

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from slipid.support.content import Content
@@ -16,10 +16,6 @@ from slipid.support.parsing import Step, spelled, toml_of
 
 CLOSED = ConfigDict(extra="forbid")
 """Pydantic config of dataclasses that describe tables of a TOML file: unknown keys are errors."""
-Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
-Part = Annotated[float, Field(ge=0, lt=1)]
-"""Fraction of a whole, at least 0 and below 1 [1]."""
 _MOST_BYTES = 4 * 2**20
 Model = TypeVar("Model")
 

@@ -1,7 +1,11 @@
 """Answers about a robot, and parsing of their texts."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import get_type_hints
+
+from slipid.app.config import LimitsSection, Place
+from slipid.support.quantities import Degrees, TicksPerTurn, bounds_of
 
 RobotOptions = Mapping[str, str]
 """Values of the command-line options that describe a robot, keyed by attribute of `RobotAnswers`.
@@ -39,53 +43,46 @@ class RobotAnswers:
     """Names of the attributes that have a default value because there was no answer."""
 
 
-LARGEST = 1e9
-"""Largest number in an answer; far larger ones overflow in computations."""
-
-
-def positive(text: str, _: RobotAnswers) -> float:
-    """Return the number above 0 in an answer.
+def within(kind: object) -> Callable[[str, RobotAnswers], float]:
+    """Return a parser of numbers of a kind that has bounds, such as `Length`.
 
     Like all parsers below, it raises `ValueError` for any other answer.
     """
-    value = number(text)
-    if not 0 < value < float("inf"):
-        raise ValueError("expected a number above 0")
-    return value
+    return lambda text, _: number(text, kind)
 
 
-def not_negative(text: str, _: RobotAnswers) -> float:
-    """Return the number, 0 or more, in an answer."""
-    value = number(text)
-    if not 0 <= value < float("inf"):
-        raise ValueError("expected a number above 0, or 0 where there is none")
-    return value
+def ticks(text: str, _: RobotAnswers) -> float:
+    """Return the ticks per turn in an answer; 0 where no ticks are logged."""
+    return 0.0 if text.strip() in ("0", "0.0") else number(text, TicksPerTurn)
 
 
 FROM_LOGS = "from the logs"
 """Answer to a question about a limit that the logs are to show; an empty answer says the same."""
 
 
-def positive_if_any(text: str, answers: RobotAnswers) -> float | None:
-    """Return the number above 0 in an answer, or None if the logs are to show it."""
-    return None if text.strip() in ("", FROM_LOGS) else positive(text, answers)
+def limit(name: str) -> Callable[[str, RobotAnswers], float | None]:
+    """Return a parser of a limit of the config; it returns None if the logs are to show it."""
+    kind = get_type_hints(LimitsSection, include_extras=True)[name]
+    return lambda text, _: None if text.strip() in ("", FROM_LOGS) else number(text, kind)
 
 
-def number(text: str) -> float:
-    """Return the number in a string; it has an absolute value of at most `LARGEST`."""
+def number(text: str, kind: object) -> float:
+    """Return the number of a kind in a string."""
     try:
         value = float(text.strip().replace("_", "?"))
     except ValueError:
         comma = " with a decimal point" if "," in text else ""
         raise ValueError(f"expected a number{comma}") from None
-    if LARGEST < abs(value) < float("inf"):
-        raise ValueError(f"expected a number of at most {LARGEST:g}")
+    bounds = bounds_of(kind)
+    assert bounds is not None
+    if not bounds.holds(value):
+        raise ValueError(f"expected a number {bounds}")
     return value
 
 
 def count(text: str, _: RobotAnswers) -> int:
     """Return the number of wheels, from 3 to 12, in an answer."""
-    if not text.strip().isdecimal() or not 3 <= int(text) <= 12:
+    if text.strip() not in map(str, range(3, 13)):
         raise ValueError("expected a whole number from 3 to 12")
     return int(text)
 
@@ -123,7 +120,7 @@ def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
 
     Semicolons are accepted as well.
     """
-    found = tuple(number(part) for part in parts(text))
+    found = tuple(number(part, Degrees) for part in parts(text))
     if len(found) != answers.wheels:
         raise ValueError(f"{len(found)} angles; expected {answers.wheels}, one per wheel")
     return found
@@ -131,7 +128,7 @@ def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
 
 def places(text: str, _: RobotAnswers) -> tuple[tuple[float, ...], ...]:
     """Return the centres x, y of two or more wheels [m], written like `0.2,0.1; 0.2,-0.1`."""
-    found = tuple(tuple(number(c) for c in part.split(",")) for part in text.split(";"))
+    found = tuple(tuple(number(c, Place) for c in part.split(",")) for part in text.split(";"))
     if len(found) < 2 or any(len(place) != 2 for place in found):
         raise ValueError("expected x, y of each wheel, as in: 0.2, 0.1; 0.2, -0.1; -0.2, 0")
     return found
@@ -145,4 +142,4 @@ def rollers(text: str, answers: RobotAnswers) -> tuple[float | None, ...]:
     words = [part.strip().lower() for part in parts(text)]
     if len(words) != answers.wheels:
         raise ValueError(f"{len(words)} rollers; expected {answers.wheels}, one per wheel")
-    return tuple(None if word == "none" else number(word) for word in words)
+    return tuple(None if word == "none" else number(word, Degrees) for word in words)

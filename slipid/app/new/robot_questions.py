@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field
 
 from slipid.app.config import Wheels, geometry
 from slipid.app.new.from_reference import (
@@ -20,16 +20,18 @@ from slipid.app.new.robot_answers import (
     angles,
     axle,
     count,
-    not_negative,
+    limit,
     one_or_two,
     parts,
     places,
-    positive,
-    positive_if_any,
     rollers,
+    ticks,
+    within,
     yes,
 )
 from slipid.support.errors import DataError, did_you_mean
+from slipid.support.quantities import GearRatio, Length, Mass
+from slipid.support.toml_file import Section, checked
 
 Asker = Callable[[str, str, str], str]
 """Function that asks the user, and returns the answer or the default.
@@ -37,7 +39,12 @@ Asker = Callable[[str, str, str], str]
 Its arguments are the question, the default, and a message about what was wrong with the previous
 answer (empty at first).
 """
-_SECTION: TypeAdapter[Wheels] = TypeAdapter(Annotated[Wheels, Field(discriminator="drive")])
+
+
+class _RobotTable(Section):
+    """A config that has no more than a robot."""
+
+    robot: Annotated[Wheels, Field(discriminator="drive")]
 
 
 @dataclass(frozen=True)
@@ -101,10 +108,14 @@ _AZIMUTHS = RobotQuestion(
     _even_azimuths,
     angles,
 )
-_BASE = RobotQuestion("base_radius_m", "from the middle to the wheel centres [m]", "0.15", positive)
-_WHEELBASE = RobotQuestion("wheelbase_m", "wheelbase, front to rear axle [m]", "0.3", positive)
+_BASE = RobotQuestion(
+    "base_radius_m", "from the middle to the wheel centres [m]", "0.15", within(Length)
+)
+_WHEELBASE = RobotQuestion(
+    "wheelbase_m", "wheelbase, front to rear axle [m]", "0.3", within(Length)
+)
 _TRACK = RobotQuestion(
-    "track_m", "track, between the middles of left and right wheels [m]", "0.3", positive
+    "track_m", "track, between the middles of left and right wheels [m]", "0.3", within(Length)
 )
 _SHARED = RobotQuestion(
     "shared", "does one motor turn both wheels of a side (yes or no)", "no", yes
@@ -130,33 +141,39 @@ _ROLLERS = RobotQuestion(
     rollers,
 )
 COMMON = (
-    RobotQuestion("wheel_radius_m", "wheel radius [m]", "0.05", positive),
-    RobotQuestion("gear_ratio", "motor turns per wheel turn", "1", positive),
-    RobotQuestion("mass_kg", "mass of the robot [kg]", "10", positive),
+    RobotQuestion("wheel_radius_m", "wheel radius [m]", "0.05", within(Length)),
+    RobotQuestion("gear_ratio", "motor turns per wheel turn", "1", within(GearRatio)),
+    RobotQuestion("mass_kg", "mass of the robot [kg]", "10", within(Mass)),
     RobotQuestion(
         "ticks_per_revolution",
         "encoder ticks per motor turn (0: no ticks are logged)",
         "1000",
-        not_negative,
+        ticks,
     ),
 )
 LIMITS = (
     RobotQuestion(
-        "speed_m_s", "highest speed a controller may demand [m/s]", FROM_LOGS, positive_if_any
+        "speed_m_s", "highest speed a controller may demand [m/s]", FROM_LOGS, limit("speed_m_s")
     ),
     RobotQuestion(
-        "yaw_rate_rad_s", "highest yaw rate it may demand [rad/s]", FROM_LOGS, positive_if_any
+        "yaw_rate_rad_s",
+        "highest yaw rate it may demand [rad/s]",
+        FROM_LOGS,
+        limit("yaw_rate_rad_s"),
     ),
     RobotQuestion(
         "acceleration_m_s2",
         "highest acceleration of a wheel's rim [m/s^2]",
         FROM_LOGS,
-        positive_if_any,
+        limit("acceleration_m_s2"),
     ),
     RobotQuestion(
-        "wheel_speed_rad_s", "highest speed of a wheel [rad/s]", FROM_LOGS, positive_if_any
+        "wheel_speed_rad_s",
+        "highest speed of a wheel [rad/s]",
+        FROM_LOGS,
+        limit("wheel_speed_rad_s"),
     ),
-    RobotQuestion("voltage_v", "voltage of the supply [V]", FROM_LOGS, positive_if_any),
+    RobotQuestion("voltage_v", "voltage of the supply [V]", FROM_LOGS, limit("voltage_v")),
 )
 """Questions about the limits of a controller, asked last; wheels that are steered have none."""
 _OPTIONAL = frozenset(question.name for question in (_WHEELS, *LIMITS))
@@ -290,8 +307,8 @@ def robot_of(answers: RobotAnswers) -> Wheels:
     for key in ("drive", "wheel_radius_m", "gear_ratio", "mass_kg"):
         own[key] = getattr(answers, key)
     own["limits"] = {question.name: getattr(answers, question.name) for question in LIMITS}
+    robot = checked(f"drive {answers.drive}", {"robot": own}, _RobotTable).robot
     try:
-        robot = _SECTION.validate_python(own)
         geometry(robot)
     except ValueError as error:
         raise DataError(f"drive {answers.drive}: {error}") from None

@@ -26,6 +26,7 @@ from slipid.infer.bench.motor import BenchMotor, BenchRoot
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot
 from slipid.parameter import Declaration, Entry, entries
+from slipid.support.quantities import Bounds
 
 _ATTRIBUTE = re.compile(r"^([a-z_0-9]+(?:, [a-z_0-9]+)*): (.+)$")
 _NEXT_ATTRIBUTE = re.compile(r"; (?=[a-z_0-9]+: )")
@@ -271,9 +272,12 @@ def _length_text(limits: tuple[object, ...]) -> str:
 
 def _limits(limits: tuple[object, ...]) -> str:
     signs = {Gt: (">", "gt"), Ge: (">=", "ge"), Lt: ("<", "lt"), Le: ("<=", "le")}
+    unpacked = _unpacked(limits)
+    if within := next((one for one in unpacked if isinstance(one, Bounds)), None):
+        return f" {within}"
     bounds = {
         f"{sign} {getattr(one, attribute):g}"
-        for one in _unpacked(limits)
+        for one in unpacked
         for kind, (sign, attribute) in signs.items()
         if isinstance(one, kind)
     }

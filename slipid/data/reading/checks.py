@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import TURNS, Layout, SensorLayout
+from slipid.data.reading.layout import CHANNELS, TURNS, Layout, SensorLayout
 from slipid.data.reading.signal import Signal, first_true
 from slipid.data.reading.table import Table
 from slipid.data.wheel_signals import integral
@@ -15,6 +15,12 @@ from slipid.support.errors import DataError, bad_data
 MIN_ROWS = 2
 """Least number of rows of a run; fewer rows show no motion."""
 
+LARGEST = 1e18
+"""Largest magnitude of a number in a log; greater ones are damaged cells."""
+_FARTHEST_M = 1e8
+"""Largest coordinate of a pose [m]; an easting or northing of UTM is below 1e7."""
+_FASTEST_RAD_S = 1e6
+"""Largest usual speed of a wheel [rad/s]; ticks that are read as angles stay below it."""
 # Largest possible magnitudes for wheeled robots; above them the unit or the sensor must be wrong.
 _LIMITS = {
     "wheel_speed": (1000.0, "rad/s"),
@@ -63,6 +69,15 @@ class UnusablePose(DataError):
     """
 
 
+def check_sizes(signals: Mapping[str, Signal]) -> None:
+    """Raise `DataError` if a value is too large after its conversion to SI units."""
+    for name, signal in signals.items():
+        for i, j in np.argwhere(np.abs(signal.values) > LARGEST)[:1].tolist():
+            found = f"a {name} of {signal.values[i, j]:g} {CHANNELS[name]}"
+            expected = "a measured number; are unit, scale and offset of the layout right?"
+            raise signal.source.error(found, expected, sample=i, column=j)
+
+
 def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
     """Raise `DataError` if a log has impossible magnitudes, signs or jumps, or a stuck channel.
 
@@ -99,7 +114,16 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout)
     rates = np.abs(np.diff(log.wheel_angle, axis=0)) / np.diff(log.time)[:, None]
     # In correct logs, the jump after a telemetry stall is about ten times the usual wheel speed;
     # the jump of a restarted counter is about a hundred times it.
-    limit = max(30.0, 20.0 * float(np.quantile(rates, 0.99)))
+    usual = float(np.quantile(rates, 0.99))
+    if usual > _FASTEST_RAD_S:
+        i, j = _first(rates > _FASTEST_RAD_S)
+        found = f"the wheel turns {rates[i, j]:.4g} rad/s"
+        expected = (
+            f"at most {_FASTEST_RAD_S:g}; are unit, scale, ticks_per_revolution and gear_ratio of "
+            "the layout right?"
+        )
+        raise _at(log, signals, "wheel", i + 1, j, found, expected)
+    limit = max(30.0, 20.0 * usual)
     if rates.max() > limit:
         i, j = _first(rates > limit)
         found = f"the wheel turns {rates[i, j]:.4g} rad/s here"
@@ -124,6 +148,11 @@ def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -
     assert log.pose_fresh is not None
     rows = np.flatnonzero(log.pose_fresh)
     pose = log.pose[rows]
+    if (np.abs(pose[:, :2]) > _FARTHEST_M).any():
+        i, j = _first(np.abs(pose[:, :2]) > _FARTHEST_M)
+        found = f"a coordinate of {pose[i, j]:.4g} m"
+        expected = f"at most {_FARTHEST_M:g}; is the unit of the column right?"
+        raise _at(log, signals, ("pose_x", "pose_y")[j], int(rows[i]), 0, found, expected)
     steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
     turns, most = np.degrees(np.abs(np.diff(pose[:, 2]))), np.degrees(layout.max_heading_jump)
     steps, turns = np.nan_to_num(steps), np.nan_to_num(turns)  # of coordinates without a sensor

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
+from reprlib import repr as shortened
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from slipid.data.reading.table import named_rows
 from slipid.support.errors import bad_data, did_you_mean
 
 _END = ("x_m", "y_m", "heading_deg")
+_LARGEST = 1e8
+"""Largest size of a coordinate [m] or heading [deg]."""
 _START = tuple(f"start_{name}" for name in _END)
 
 
@@ -110,8 +113,9 @@ def _number(path: Path, row: int, cells: dict[str, str], column: str) -> float:
         value = float(text) if text else nan
     except ValueError:
         value = float("inf")
-    if text and not isfinite(value):
-        raise bad_data(path, f"'{text}'", "a number or nothing", row=row, column=column)
+    if text and not abs(value) <= _LARGEST:
+        expected = f"a number of at most {_LARGEST:g}, or nothing"
+        raise bad_data(path, shortened(text), expected, row=row, column=column)
     return value
 
 

@@ -9,15 +9,24 @@ from pydantic import (
     BeforeValidator,
     Field,
     StrictBool,
-    StrictFloat,
-    StrictInt,
     StrictStr,
 )
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.units import converts, factor
 from slipid.support.errors import did_you_mean
-from slipid.support.toml_file import CLOSED, Positive
+from slipid.support.quantities import (
+    Bounds,
+    CellLength,
+    GearRatio,
+    Length,
+    Offset,
+    Positive,
+    Scale,
+    Seconds,
+    TicksPerTurn,
+)
+from slipid.support.toml_file import CLOSED
 
 PER_WHEEL = {
     "wheel_ticks": "tick",
@@ -65,7 +74,10 @@ AT_RIM = {"wheel_angle": "m", "wheel_speed": "m/s", "wheel_speed_command": "m/s"
 TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
 """Channels from which the turns of the wheels can be computed; the first available one is used."""
 
-Count = Annotated[int, Field(ge=0, strict=True)]
+RowNumber = Annotated[int, Bounds(0, 1e6)]
+"""Number of a row of a file, counted from 1; 0 for none."""
+Position = Annotated[int, Bounds(0, 1e5)]
+"""Position of a column, counted from 0."""
 
 
 def several(value: object) -> object:
@@ -89,13 +101,13 @@ class Channel:
     """
 
     columns: Annotated[
-        tuple[StrictStr | StrictInt, ...],
+        tuple[StrictStr | Position, ...],
         BeforeValidator(several),
         Field(min_length=1, validation_alias=AliasChoices("columns", "column")),
     ]
     unit: StrictStr
-    scale: Annotated[tuple[StrictFloat, ...], BeforeValidator(several)] = (1.0,)
-    offset: StrictFloat = 0.0
+    scale: Annotated[tuple[Scale, ...], BeforeValidator(several)] = (1.0,)
+    offset: Offset = 0.0
 
     def __post_init__(self) -> None:
         if len(self.scale) not in (1, len(self.columns)):
@@ -129,14 +141,14 @@ class SensorLayout:
             larger one is left out.
     """
 
-    ticks_per_revolution: Positive | None = None
-    gear_ratio: Positive = 1.0
+    ticks_per_revolution: TicksPerTurn | None = None
+    gear_ratio: GearRatio = 1.0
     ticks_are_increments: StrictBool = False
-    tick_bits: Count = 32
+    tick_bits: Annotated[int, Bounds(1, 64)] = 32
     current_is_signed: StrictBool = True
     torque_constant: Positive | None = None
-    wheel_radius: Positive | None = None
-    max_gap: Positive = 1.0
+    wheel_radius: Length | None = None
+    max_gap: Seconds = 1.0
     max_pose_jump: Positive = 0.5
     max_heading_jump: Positive = 1.6
 
@@ -206,11 +218,11 @@ class Layout(SensorLayout):
 
     channels: Mapping[str, Channel]
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
-    names_row: Count = 1
-    units_row: Count = 0
-    first_data_row: Count = 2
-    row_period: Positive | None = None
-    metres_per_pixel: Annotated[tuple[Positive, Positive] | None, BeforeValidator(_pair)] = None
+    names_row: RowNumber = 1
+    units_row: RowNumber = 0
+    first_data_row: RowNumber = 2
+    row_period: Seconds | None = None
+    metres_per_pixel: Annotated[tuple[CellLength, CellLength] | None, BeforeValidator(_pair)] = None
     new_run: Literal["never", "time_restarts", "ticks_restart"] = "never"
     drop_repeated_time: StrictBool = False
     clock: Literal["robot", "own"] = "robot"

@@ -10,6 +10,7 @@ from dataclasses import fields, replace
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SINGLE, Channel, Layout, unknown
 from slipid.data.reading.units import same_unit
 from slipid.support.errors import DataError
+from slipid.support.quantities import inside
 from slipid.support.toml_file import checked
 
 
@@ -191,6 +192,10 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
     layout = _declared_file(given, where)
     beside = dict(layout.beside)
     for name, one in others.items():
+        try:
+            inside(name)
+        except ValueError as error:
+            raise DataError(f"{where} beside: {error}") from error
         beside[name] = _declared_file(one, f"{where} beside.'{name}'")
     layout = replace(layout, beside=beside)
     if problem := _problem(layout):
@@ -202,7 +207,7 @@ def _declared_file(table: Mapping[str, object], where: str) -> Layout:
     """Return the layout of a single file from its table; `where` is its name in messages."""
     given = dict(table)
     name, columns = given.pop("format", None), given.pop("columns", {})
-    if name is not None and name not in PRESETS:
+    if name is not None and not (isinstance(name, str) and name in PRESETS):
         raise DataError(f"{where}: {unknown('format', name, PRESETS)}")
     for key in given:
         if key not in _SETTINGS:
@@ -210,7 +215,7 @@ def _declared_file(table: Mapping[str, object], where: str) -> Layout:
             raise DataError(f"{where}: {unknown('key', key, known)}")
     if not isinstance(columns, dict):
         raise DataError(f"{where} columns: {columns!r}; expected a table of channels")
-    base = Layout({}) if name is None else PRESETS[str(name)]
+    base = Layout({}) if name is None else PRESETS[name]
     channels = dict(base.channels)
     for channel, spec in columns.items():
         if channel not in CHANNELS:

@@ -1,10 +1,11 @@
 """Reader of logs: functions that read files with a layout and return checked runs in SI units."""
 
 import hashlib
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise, takewhile
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,14 @@ from slipid.data.log import Log
 from slipid.data.reading.assemble import assembled, clock_against
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import read_bag
-from slipid.data.reading.checks import MIN_ROWS, UnusablePose, check_log, check_time
+from slipid.data.reading.checks import (
+    LARGEST,
+    MIN_ROWS,
+    UnusablePose,
+    check_log,
+    check_sizes,
+    check_time,
+)
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
 from slipid.data.reading.signal import (
@@ -29,11 +37,12 @@ from slipid.data.reading.signal import (
 from slipid.data.reading.table import Table, read_table
 from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError, first_names
+from slipid.support.quantities import inside
 
 AnyLayout = Layout | BagLayout
 """Layout of a file of rows (CSV or Parquet) or of a bag."""
-LARGEST = 1e18
-"""Largest magnitude of a number in a log; greater ones are damaged cells."""
+MOST_FILES = 200_000
+"""Largest number of files that a glob with ** may search."""
 Session = Literal["surface/load/speed", "folder", "file"]
 """Property that the runs of one session have in common; within a session the camera's marker was
 not moved on the robot."""
@@ -132,6 +141,7 @@ def read_logs(
     logs: list[Log] = []
     aside: list[str] = []
     for run in raw:
+        check_sizes(run.signals)
         log = assembled(run, layout)
         try:
             check_log(log, run.signals, layout)
@@ -181,13 +191,41 @@ def _parts(table: Table, layout: Layout) -> list[tuple[Table, str]]:
 def _beside(path: Path, pattern: str, layout: Layout) -> Table:
     """Return the table of an additional file of a run, in the folder of its main file `path`."""
     other = path.parent / pattern.replace("{stem}", path.stem)
-    if not other.is_file():
+    if not os.path.isfile(other):  # unlike Path.is_file, False for a name that is too long
         there = sorted(p.name for p in path.parent.iterdir() if p.is_file() and p != path)
         raise DataError(
             f"{other}: missing; expected in the folder of {path.name}, as declared in the layout "
             f"(the folder has {first_names(there, 'nothing else')})"
         )
     return read_table(other, layout)
+
+
+def matching(root: Path, pattern: str) -> list[Path]:
+    """Return the files and folders below `root` that match a glob.
+
+    Raises:
+        DataError: the glob leaves the folder, or searches more than `MOST_FILES` files below it.
+    """
+    try:
+        levels = Path(inside(pattern)).parts
+        if levels.count("**") > 1:
+            raise ValueError(f"'{pattern}' has several **; expected at most one")
+        if "**" in levels:
+            fixed = takewhile(lambda part: not set(part) & set("*?["), levels)
+            walk = os.walk(root.joinpath(*fixed))
+            counts = accumulate(len(folders) + len(files) for _, folders, files in walk)
+            if any(count > MOST_FILES for count in counts):
+                raise ValueError(
+                    f"'{pattern}' searches more than {MOST_FILES} files; expected a glob with the "
+                    "names of the folders, or a smaller folder"
+                )
+        return list(root.glob(pattern))
+    except (ValueError, OSError) as error:
+        raise DataError(f"{root}: {error}") from error
+
+
+def _is_bag(path: Path) -> bool:
+    return (path / "metadata.yaml").is_file()
 
 
 def find_logs(root: Path, pattern: str) -> list[Path]:
@@ -198,7 +236,7 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
     """
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs")
-    found = sorted(p for p in root.glob(pattern) if p.is_file() or (p / "metadata.yaml").is_file())
+    found = sorted(p for p in matching(root, pattern) if p.is_file() or _is_bag(p))
     if found:
         return found
     nearest = root
@@ -221,11 +259,16 @@ def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
     """
     if isinstance(layout, BagLayout):
         return list(paths)
-    further = {
-        path.parent / pattern.replace("{stem}", path.stem)
-        for path in paths
-        for pattern in layout.beside
-    }
+    further = set()
+    for path in paths:
+        for pattern in layout.beside:
+            other = path.parent / pattern.replace("{stem}", path.stem)
+            if other == path and "{stem}" in pattern:
+                raise DataError(
+                    f"{path}: '{pattern}', the name of an additional file in the layout, is that "
+                    "of the run's main file; expected a name such as '{stem}.poses.csv'"
+                )
+            further.add(other)
     return [path for path in paths if path not in further]
 
 

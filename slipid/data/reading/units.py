@@ -3,6 +3,7 @@
 import re
 from contextlib import suppress
 from functools import lru_cache
+from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Any
 
 from slipid.support.errors import did_you_mean
@@ -43,10 +44,10 @@ KNOWN = (
     *("s", "ms", "us", "ns", "min", "m", "mm", "cm", "inch", "rad", "deg", "rev", "rad/s", "deg/s"),
     *("rpm", "rev/s", "m/s", "mm/s", "A", "mA", "V", "mV", "tick", "pixel", "percent", "1", "N*m"),
 )
-_LONGEST = 40
-"""Largest number of characters of a unit."""
-_POWER = re.compile(r"(\*\*|\^)(?!\s*-?\d(?![\d.]|\s*(\*\*|\^)))")
-"""A power other than one digit, such as that of 10**10**10, which would be evaluated for hours."""
+_FACTOR = r"(?:[^\W\d_]+|%|°|1)(?:(?:\*\*|\^)-?\d)?"
+_GRAMMAR = re.compile(rf"{_FACTOR}(?:(?: ?[*/·] ?| ){_FACTOR}){{0,5}}")
+"""Up to six names, each perhaps to the power of one digit, in products and quotients. Pint gets no
+other text, since it computes what it reads: 10**10**10 would take hours."""
 
 
 @lru_cache(maxsize=1)
@@ -68,15 +69,16 @@ def factor(unit: str, target: str) -> float:
     Raises:
         ValueError: the unit is unknown, or has another dimension than the target.
     """
-    if len(unit) > _LONGEST or _POWER.search(unit):
-        raise ValueError(f"unknown unit '{unit[:_LONGEST]}' (known: {', '.join(KNOWN)})")
+    text = _ALIASES.get(unit.strip(), unit.strip())
+    known = f"{did_you_mean(unit[:40], KNOWN)} (known: {', '.join(KNOWN)})"
+    if not _GRAMMAR.fullmatch(text):
+        raise ValueError(f"unknown unit {shortened(unit)}{known}")
     registry = _registry()
     wanted = registry.parse_units(_ALIASES.get(target, target))
     try:
-        given = registry.parse_units(_ALIASES.get(unit.strip(), unit.strip()))
+        given = registry.parse_units(text)
     except Exception as error:  # pint raises many types of errors, even from tokenize
-        known = f"{did_you_mean(unit, KNOWN)} (known: {', '.join(KNOWN)})"
-        raise ValueError(f"unknown unit '{unit}'{known}") from error
+        raise ValueError(f"unknown unit {shortened(unit)}{known}") from error
     if given.dimensionality != wanted.dimensionality:
         raise ValueError(f"unit '{unit}' cannot be converted to {target}")
     return float(registry.Quantity(1.0, given).to(wanted).magnitude)

@@ -161,7 +161,7 @@ def named_runs(runs: Sequence[SiteRun], jitter: float, seed: int) -> list[tuple[
 
     Headings change at random by at most `jitter` [rad], as if the robot were placed by hand.
     """
-    rng = np.random.default_rng(seed)
+    rng, jitter = np.random.default_rng(seed), abs(jitter)  # numpy refuses a range of -0 to 0
     counts: dict[str, int] = {}
     out = []
     for run in runs:

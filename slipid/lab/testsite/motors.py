@@ -3,10 +3,10 @@
 from math import exp, floor, pi
 from typing import Annotated, Literal
 
-from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from slipid.support.toml_file import CLOSED, NotNegative, Positive
+from slipid.support.quantities import Bounds, NotNegative, Positive
+from slipid.support.toml_file import CLOSED
 
 
 @dataclass(frozen=True, config=CLOSED)
@@ -30,10 +30,10 @@ class MotorBuild:
     rotor_inertia_kg_m2: Positive = 7.1e-6
     coulomb_nm: NotNegative = 0.07
     viscous_nms: NotNegative = 0.006
-    efficiency: Annotated[float, Field(gt=0, le=1)] = 0.9
+    efficiency: Annotated[float, Bounds(1e-3, 1)] = 0.9
     supply_v: Positive = 24.0
     supply_ohm: NotNegative = 0.15
-    ticks_per_revolution: Annotated[int, Field(ge=10)] = 2000
+    ticks_per_revolution: Annotated[int, Bounds(10, 1e9)] = 2000
 
 
 @dataclass(frozen=True, config=CLOSED)

@@ -4,12 +4,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from slipid.lab.testsite.robot_build import RobotBuild
 from slipid.support.content import Content
-from slipid.support.toml_file import CLOSED, NotNegative, Positive
+from slipid.support.quantities import Bounds, Degrees, Length, NotNegative, Positive
+from slipid.support.toml_file import CLOSED
 
 
 @dataclass(frozen=True, config=CLOSED)
@@ -28,15 +29,15 @@ class OmniBuild(RobotBuild):
     """
 
     drive: Literal["omni"] = "omni"
-    wheel_azimuths_deg: Annotated[tuple[FiniteFloat, ...], Field(min_length=3)] = (
+    wheel_azimuths_deg: Annotated[tuple[Degrees, ...], Field(min_length=3, max_length=100)] = (
         60.0,
         180.0,
         300.0,
     )
-    base_radius_m: Positive = 0.125
-    rollers: Annotated[int, Field(ge=6, multiple_of=2)] = 12
-    roller_radius_m: Positive = 0.009
-    roller_mass_kg: Annotated[FiniteFloat, Field(ge=1e-4)] = 0.012
+    base_radius_m: Length = 0.125
+    rollers: Annotated[int, Bounds(6, 100), Field(multiple_of=2)] = 12
+    roller_radius_m: Length = 0.009
+    roller_mass_kg: Annotated[float, Bounds(1e-4, 1e3, "kg")] = 0.012
     row_offset_m: NotNegative = 0.006
     mount_n_m: Positive = 2e4
     roller_friction_nm: NotNegative = 0.012

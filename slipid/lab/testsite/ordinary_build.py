@@ -4,16 +4,16 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat
 from pydantic.dataclasses import dataclass
 
 from slipid.lab.testsite.robot_build import RobotBuild
 from slipid.support.content import Content
-from slipid.support.toml_file import CLOSED, NotNegative, Positive
+from slipid.support.quantities import Bounds, Coordinate, Length, Mass, NotNegative
+from slipid.support.toml_file import CLOSED
 
 IMPEDANCE = 0.1
 """Largest impedance of the engine's contacts beneath wheels and castor [1]."""
-RadiusError = Annotated[float, Field(gt=-0.2, lt=0.2)]
+RadiusError = Annotated[float, Bounds(-0.2, 0.2)]
 """True radius of a wheel over its nominal radius, less 1 [1]."""
 
 
@@ -37,14 +37,14 @@ class OrdinaryBuild(RobotBuild):
     """
 
     drive: Literal["differential", "skid"] = "skid"
-    track_m: Positive = 0.4
-    wheelbase_m: Positive | None = None
+    track_m: Length = 0.4
+    wheelbase_m: Length | None = None
     motors: Literal["side", "wheel"] = "side"
-    castor_m: tuple[FiniteFloat, FiniteFloat] | None = None
-    castor_radius_m: Positive = 0.02
-    castor_mass_kg: Positive = 0.1
+    castor_m: tuple[Coordinate, Coordinate] | None = None
+    castor_radius_m: Length = 0.02
+    castor_mass_kg: Mass = 0.1
     castor_friction_nm: NotNegative = 0.005
-    wheel_width_m: Positive = 0.03
+    wheel_width_m: Length = 0.03
     radius_error: tuple[RadiusError, RadiusError] = (0.0, 0.0)
 
     def __post_init__(self) -> None:

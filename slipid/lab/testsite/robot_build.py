@@ -7,11 +7,12 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from slipid.support.content import Content
-from slipid.support.toml_file import CLOSED, Positive
+from slipid.support.quantities import Bounds, Coordinate, Degrees, GearRatio, Length, Mass
+from slipid.support.toml_file import CLOSED
 
 MIN_LOAD_SHARE = 0.02
 """Fraction of the weight that every wheel and castor must carry at least [1]."""
@@ -35,19 +36,19 @@ class RobotBuild(ABC):
         marker_yaw_deg: heading of the marker less that of the body [deg].
     """
 
-    mass_kg: Positive = 12.0
-    centres_m: Annotated[Mapping[str, tuple[float, float]], Field(min_length=1)] = field(
+    mass_kg: Mass = 12.0
+    centres_m: Annotated[Mapping[str, tuple[Coordinate, Coordinate]], Field(min_length=1)] = field(
         default_factory=lambda: {"as_built": (-0.021, 0.002), "moved": (-0.004, -0.012)}
     )
-    centre_height_m: Annotated[float, Field(ge=0, le=0.5)] = 0.06
-    wheel_radius_m: Positive = 0.04
-    gear_ratio: Positive = 16.0
-    wheel_mass_kg: Positive = 0.3
-    body_radius_m: Positive = 0.18
-    marker_place_m: tuple[FiniteFloat, FiniteFloat] = (0.0, 0.0)
-    marker_height_m: float = 0.25
-    marker_size_m: Positive = 0.131
-    marker_yaw_deg: FiniteFloat = -0.9
+    centre_height_m: Annotated[float, Bounds(0, 0.5, "m")] = 0.06
+    wheel_radius_m: Length = 0.04
+    gear_ratio: GearRatio = 16.0
+    wheel_mass_kg: Mass = 0.3
+    body_radius_m: Length = 0.18
+    marker_place_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
+    marker_height_m: Length = 0.25
+    marker_size_m: Length = 0.131
+    marker_yaw_deg: Degrees = -0.9
 
     def __post_init__(self) -> None:
         if self.chassis_mass_kg <= 0:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from slipid.data import floor_map as terrain
 from slipid.data.floor_map import read_map
@@ -14,11 +14,12 @@ from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.ordinary_build import OrdinaryBuild
 from slipid.lab.testsite.site import SiteCamera, SiteSensors
 from slipid.lab.testsite.surfaces import SurfacePhysics
+from slipid.support.quantities import Bounds, Degrees, InsidePath, Seed
 from slipid.support.toml_file import Section
 
-Speed = Annotated[float, Field(gt=0, le=3)]
+Speed = Annotated[float, Bounds(1e-3, 3, "m/s")]
 Speeds = Annotated[list[Speed], Field(min_length=1)]
-Distance = Annotated[float, Field(gt=0, le=100)]
+Distance = Annotated[float, Bounds(1e-3, 100, "m")]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 """Name of a surface, load set-up or map, which is also used in names of files and folders."""
 
@@ -27,7 +28,7 @@ class FileMap(Section):
     """Floor map that is read from a file in the folder of the config."""
 
     kind: Literal["file"]
-    file: str
+    file: InsidePath
 
     def floor(self, folder: Path) -> terrain.FloorMap:
         return read_map(folder / self.file)
@@ -38,9 +39,9 @@ class Patchwork(Section):
 
     kind: Literal["patchwork"]
     surfaces: list[str] = Field(min_length=1)
-    seed: int = Field(0, ge=0)
-    patch_m: float = Field(0.25, ge=0.01, le=10)
-    half_m: float = Field(1.2, ge=0.4, le=20)
+    seed: Seed = 0
+    patch_m: Annotated[float, Bounds(0.01, 10, "m")] = 0.25
+    half_m: Annotated[float, Bounds(0.4, 20, "m")] = 1.2
 
     def floor(self, folder: Path) -> terrain.FloorMap:
         return terrain.patchwork(self.surfaces, self.seed, self.patch_m, self.half_m)
@@ -76,8 +77,8 @@ class HeadingRuns(SurfaceRuns):
     """Straight runs in evenly spaced directions."""
 
     kind: Literal["headings"] = "headings"
-    step_deg: float = Field(15.0, ge=0.1, le=360)
-    first_deg: float = Field(0.0, allow_inf_nan=False)
+    step_deg: Annotated[float, Bounds(0.1, 360, "deg")] = 15.0
+    first_deg: Degrees = 0.0
     speeds_m_s: Speeds = Field(default=[0.1, 0.2])
     distance_m: Distance = 0.7
 
@@ -90,7 +91,7 @@ class CurveRuns(SurfaceRuns):
     """Runs along arcs, alternately to the left and to the right."""
 
     kind: Literal["curves"] = "curves"
-    count: int = Field(4, ge=1, le=10_000)
+    count: Annotated[int, Bounds(1, 10_000)] = 4
     speeds_m_s: Speeds = Field(default=[0.1, 0.2])
     distance_m: Distance = 0.7
 
@@ -110,7 +111,7 @@ class PaperGridRuns(SurfaceRuns):
     """
 
     kind: Literal["paper_grid"] = "paper_grid"
-    seconds: float = Field(3.0, gt=0, le=3600)
+    seconds: Annotated[float, Bounds(0.01, 3600, "s")] = 3.0
 
     def runs(self) -> list[SiteRun]:
         out = []
@@ -131,18 +132,13 @@ class ArcRuns(SurfaceRuns):
     """Runs ahead along arcs and straight lines, backward at negative speeds."""
 
     kind: Literal["arcs"] = "arcs"
-    curvatures_1_m: list[Annotated[float, Field(ge=-20, le=20)]] = Field(
+    curvatures_1_m: list[Annotated[float, Bounds(-20, 20, "1/m")]] = Field(
         default=[0.0, 0.5, -0.5], min_length=1
     )
-    speeds_m_s: list[Annotated[float, Field(ge=-3, le=3)]] = Field(default=[0.3], min_length=1)
+    speeds_m_s: list[Annotated[float, Bounds(1e-3, 3, "m/s", of_size=True)]] = Field(
+        default=[0.3], min_length=1
+    )
     distance_m: Distance = 1.5
-
-    @field_validator("speeds_m_s")
-    @classmethod
-    def _moves(cls, speeds: list[float]) -> list[float]:
-        if 0.0 in speeds:
-            raise ValueError("a speed of 0; expected speeds other than 0, or runs of kind spins")
-        return speeds
 
     def runs(self) -> list[SiteRun]:
         return [
@@ -156,17 +152,10 @@ class SpinRuns(SurfaceRuns):
     """Turns on the spot, to the right at negative rates."""
 
     kind: Literal["spins"] = "spins"
-    rates_deg_s: list[Annotated[float, Field(ge=-360, le=360)]] = Field(
+    rates_deg_s: list[Annotated[float, Bounds(0.1, 360, "deg/s", of_size=True)]] = Field(
         default=[40.0, -40.0], min_length=1
     )
-    angle_deg: float = Field(360.0, gt=0, le=3600)
-
-    @field_validator("rates_deg_s")
-    @classmethod
-    def _turns(cls, rates: list[float]) -> list[float]:
-        if 0.0 in rates:
-            raise ValueError("a rate of 0; expected rates other than 0")
-        return rates
+    angle_deg: Annotated[float, Bounds(0.1, 3600, "deg")] = 360.0
 
     def runs(self) -> list[SiteRun]:
         arc = SPIN_ARM_M * float(np.radians(self.angle_deg))
@@ -181,12 +170,12 @@ class PathRuns(SurfaceRuns):
     """
 
     kind: Literal["paths"] = "paths"
-    seed: int = Field(0, ge=0)
-    count: int = Field(4, ge=1, le=10_000)
-    legs: int = Field(4, ge=1, le=1000)
-    leg_s: float = Field(2.5, gt=0, le=3600)
+    seed: Seed = 0
+    count: Annotated[int, Bounds(1, 10_000)] = 4
+    legs: Annotated[int, Bounds(1, 1000)] = 4
+    leg_s: Annotated[float, Bounds(0.01, 3600, "s")] = 2.5
     speeds_m_s: Speeds = Field(default=[0.2, 0.4])
-    turn_deg_s: float = Field(40.0, gt=0, le=360)
+    turn_deg_s: Annotated[float, Bounds(0.01, 360, "deg/s")] = 40.0
 
     def runs(self) -> list[SiteRun]:
         rng, most = np.random.default_rng(self.seed), float(np.radians(self.turn_deg_s))
@@ -213,8 +202,8 @@ class WanderRuns(MapRuns):
     """Runs through random way-points on a map."""
 
     kind: Literal["wander"] = "wander"
-    count: int = Field(8, ge=1, le=10_000)
-    points: int = Field(4, ge=1, le=1000)
+    count: Annotated[int, Bounds(1, 10_000)] = 8
+    points: Annotated[int, Bounds(1, 1000)] = 4
     by: Literal["camera", "encoders"] = "camera"
 
     def runs(self, floor: terrain.FloorMap, seed: int) -> list[SiteRun]:
@@ -247,7 +236,7 @@ class RectangleRuns(MapRuns):
 
     kind: Literal["rectangle"] = "rectangle"
     by: Literal["camera", "encoders"] = "encoders"
-    repeats: int = Field(1, ge=1, le=10_000)
+    repeats: Annotated[int, Bounds(1, 10_000)] = 1
     speed_m_s: Speed = 0.2
 
     def runs(self, floor: terrain.FloorMap, seed: int) -> list[SiteRun]:
@@ -282,11 +271,11 @@ SIDEWAYS = ("headings", "curves", "paper_grid")
 class SimulationContent(Section):
     """Content of a config of `slipid simulate`."""
 
-    seed: int = Field(0, ge=0)
+    seed: Seed = 0
     formats: list[Literal["slipid", "robotino2022"]] = Field(default=["slipid"], min_length=1)
-    heading_jitter_deg: float = Field(5.0, ge=0, le=180)
-    command_delay_s: float = Field(0.12, ge=0, le=10)
-    acceleration_m_s2: float = Field(1.0, ge=0.01, le=1000)
+    heading_jitter_deg: Annotated[float, Bounds(0, 180, "deg")] = 5.0
+    command_delay_s: Annotated[float, Bounds(0, 10, "s")] = 0.12
+    acceleration_m_s2: Annotated[float, Bounds(0.01, 1000, "m/s^2")] = 1.0
     robot: OmniBuild | OrdinaryBuild = Field(default_factory=OmniBuild, discriminator="drive")
     motor: MotorBuild = MotorBuild()
     speed_loop: SpeedLoop = SpeedLoop()

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat
 from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import Rotation
 
@@ -15,12 +14,17 @@ from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.ordinary_build import OrdinaryBuild
 from slipid.lab.testsite.surfaces import SURFACES, SurfacePhysics
 from slipid.support.content import Content
-from slipid.support.toml_file import CLOSED, NotNegative, Part, Positive
+from slipid.support.quantities import Bounds, Coordinate, NotNegative, Part, Positive, Seconds
+from slipid.support.toml_file import CLOSED
 
-Interval = Annotated[float, Field(ge=1e-3, le=1)]
+Interval = Annotated[float, Bounds(1e-3, 1, "s")]
 """Time between successive readings or frames [s]."""
-Tilt = Annotated[float, Field(ge=-10, le=10)]
+Tilt = Annotated[float, Bounds(-10, 10, "deg")]
 """Tilt of the camera about one axis [deg]."""
+Pixels = Annotated[int, Bounds(16, 10_000)]
+"""Width or height of an image [pixel]."""
+Distortion = Annotated[float, Bounds(-10, 10)]
+"""Coefficient of OpenCV's lens model [1]."""
 
 
 @dataclass(frozen=True, config=CLOSED)
@@ -56,14 +60,14 @@ class SiteSensors:
     duty: bool = False
     bus_voltage: bool = False
     gyro: bool = False
-    voltage_step_v: Annotated[float, Field(ge=0.01, allow_inf_nan=False)] = 0.1
+    voltage_step_v: Annotated[float, Bounds(0.01, 1e3, "V")] = 0.1
     voltage_noise_v: NotNegative = 0.05
     gyro_noise: NotNegative = 0.004
     gyro_bias: NotNegative = 0.005
-    average_s: Annotated[float, Field(ge=0, le=1)] = 0.008
+    average_s: Annotated[float, Bounds(0, 1, "s")] = 0.008
     frame_s: Interval = 1 / 29
-    lag_s: float = 0.056
-    camera_scale: Annotated[float, Field(ge=1e-3, le=100)] = 1.117
+    lag_s: Seconds = 0.056
+    camera_scale: Annotated[float, Bounds(1e-3, 100)] = 1.117
     camera_noise_m: NotNegative = 0.0005
     camera_noise_rad: NotNegative = 0.004
     dropout: Part = 0.01
@@ -145,24 +149,24 @@ class SiteCamera:
             count from the video's start, so they are larger than log times by `early_s`.
     """
 
-    height_m: Positive = 2.2
-    focal_px: Positive = 1200.0
-    width_px: Annotated[int, Field(gt=0)] = 1920
-    height_px: Annotated[int, Field(gt=0)] = 1080
-    centre_m: tuple[FiniteFloat, FiniteFloat] = (0.0, 0.0)
+    height_m: Annotated[float, Bounds(0.1, 100, "m")] = 2.2
+    focal_px: Annotated[float, Bounds(10, 1e5, "pixels")] = 1200.0
+    width_px: Pixels = 1920
+    height_px: Pixels = 1080
+    centre_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     tilt_deg: tuple[Tilt, Tilt] = (0.6, -0.4)
-    distortion: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] = (
+    distortion: tuple[Distortion, Distortion, Distortion, Distortion] = (
         -0.06,
         0.02,
         0.0006,
         -0.0004,
     )
-    blur_px: NotNegative = 0.8
-    noise: NotNegative = 2.0
-    flicker: NotNegative = 0.06
-    exposure_s: NotNegative = 0.012
-    frame_s: Positive = 1 / 29
-    early_s: NotNegative = 0.0
+    blur_px: Annotated[float, Bounds(0, 100, "pixels")] = 0.8
+    noise: Annotated[float, Bounds(0, 255)] = 2.0
+    flicker: Annotated[float, Bounds(0, 1)] = 0.06
+    exposure_s: Annotated[float, Bounds(0, 1, "s")] = 0.012
+    frame_s: Interval = 1 / 29
+    early_s: Annotated[float, Bounds(0, 1e3, "s")] = 0.0
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:

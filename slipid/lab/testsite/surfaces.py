@@ -10,7 +10,8 @@ from pydantic.dataclasses import dataclass
 
 from slipid.data.floor_map import MOST_CELLS, FloorMap
 from slipid.data.wheel_signals import stretches
-from slipid.support.toml_file import CLOSED, Positive
+from slipid.support.quantities import Bounds
+from slipid.support.toml_file import CLOSED
 
 GRAVITY = 9.81
 """Gravitational acceleration [m/s^2]."""
@@ -46,15 +47,15 @@ class SurfacePhysics:
         colour: colour in videos, as `#rrggbb`.
     """
 
-    friction: Annotated[float, Field(gt=0, le=10)] = 0.8
-    rolling_m: Annotated[float, Field(ge=0, le=0.05)] = 0.0003
-    softness_m: Annotated[float, Field(gt=0, le=0.03)] = 0.0003
-    shear_n_m: Annotated[float, Field(ge=50, allow_inf_nan=False)] = 1e5
-    compaction: Annotated[float, Field(ge=0, le=1e7)] = 0.0
-    body_drag_n: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    rib_height_m: Annotated[float, Field(ge=0, le=0.02)] = 0.0
-    rib_distance_m: Positive = 0.03
-    unevenness: Annotated[float, Field(ge=0, le=1)] = 0.0
+    friction: Annotated[float, Bounds(1e-3, 10)] = 0.8
+    rolling_m: Annotated[float, Bounds(0, 0.05, "m")] = 0.0003
+    softness_m: Annotated[float, Bounds(1e-6, 0.03, "m")] = 0.0003
+    shear_n_m: Annotated[float, Bounds(50, 1e9, "N/m")] = 1e5
+    compaction: Annotated[float, Bounds(0, 1e7, "N/m^1.5")] = 0.0
+    body_drag_n: Annotated[float, Bounds(0, 1000, "N")] = 0.0
+    rib_height_m: Annotated[float, Bounds(0, 0.02, "m")] = 0.0
+    rib_distance_m: Annotated[float, Bounds(1e-3, 10, "m")] = 0.03
+    unevenness: Annotated[float, Bounds(0, 1)] = 0.0
     colour: Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")] = "#d9d4c7"
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFloat, StrictStr
+from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictStr
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.bag.shape import check_path
@@ -20,7 +20,8 @@ from slipid.data.reading.layout import (
     unknown,
 )
 from slipid.support.errors import DataError
-from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
+from slipid.support.quantities import Bounds, InsidePath, Offset, Scale, Seconds
+from slipid.support.toml_file import CLOSED, checked
 
 EFFORT = '"A" (current), "N*m" (motor_torque or wheel_torque), "V" (voltage) or "1" (duty)'
 """Units in which drivers publish the effort of a JointState, as text for error messages."""
@@ -51,8 +52,8 @@ class TopicChannel:
     topics: Annotated[Texts, Field(min_length=1, validation_alias=AliasChoices("topics", "topic"))]
     fields: Annotated[Texts, Field(validation_alias=AliasChoices("fields", "field"))] = ()
     unit: StrictStr | None = None
-    scale: Annotated[tuple[StrictFloat, ...], BeforeValidator(several)] = (1.0,)
-    offset: StrictFloat = 0.0
+    scale: Annotated[tuple[Scale, ...], BeforeValidator(several)] = (1.0,)
+    offset: Offset = 0.0
     frame: StrictStr | None = None
     child: StrictStr | None = None
 
@@ -88,8 +89,8 @@ class RunRule:
     between: tuple[str | int | float | bool, ...] = ("", 0, False)
     surface: StrictStr | None = None
     load: StrictStr | None = None
-    pause_s: Positive | None = None
-    table: StrictStr | None = None
+    pause_s: Seconds | None = None
+    table: InsidePath | None = None
     from_start: StrictBool = False
 
     def __post_init__(self) -> None:
@@ -120,7 +121,7 @@ class BagLayout(SensorLayout):
     joints: tuple[StrictStr, ...] = ()
     runs: RunRule | None = None
     stamp: Literal["header", "received"] = "header"
-    max_disorder: NotNegative = 0.1
+    max_disorder: Annotated[float, Bounds(0, 1e6, "s")] = 0.1
     drop_nan: StrictBool = False
     definitions: Path | None = None
 

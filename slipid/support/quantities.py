@@ -1,0 +1,135 @@
+"""Kinds of numbers and paths in configs, layouts and maps, each with the bounds that it may have.
+
+The bounds hold every robot, from a toy of 1 cm to a mining truck, with decades to spare. A value
+beyond them is a slip of the pen or another unit, and would only overflow later, in computations.
+"""
+
+from dataclasses import dataclass
+from reprlib import repr as shortened
+from typing import Annotated, Any, get_args
+
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+LONGEST_PATH = 300
+"""Largest number of characters of a path or glob in a config."""
+LONGEST_NAME = 240
+"""Largest number of bytes of the name of a file or folder; file systems have 255."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of a number, as metadata of its type: `Annotated[float, Bounds(0.1, 1e3, "m")]`.
+
+    Attributes:
+        low: lowest value [unit].
+        high: highest value [unit].
+        unit: unit, for messages and the reference; empty for pure numbers.
+        of_size: True if the bounds are those of the absolute value.
+    """
+
+    low: float | int
+    high: float | int
+    unit: str = ""
+    of_size: bool = False
+
+    def __get_pydantic_core_schema__(
+        self, source: type, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Return the schema by which pydantic checks such a number."""
+        kind = int if source is int else float
+        return core_schema.no_info_before_validator_function(
+            lambda value: self.checked(value, kind), handler(source)
+        )
+
+    def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        sign = ", of either sign" if self.of_size else ""
+        return f"from {self.low:g} to {self.high:g}{unit}{sign}"
+
+    def holds(self, value: float | int) -> bool:
+        """Return True if a number is within the bounds; NaN is not."""
+        return self.low <= (abs(value) if self.of_size else value) <= self.high
+
+    def checked(self, value: Any, kind: type[int] | type[float] = float) -> float | int:
+        """Return a number within the bounds; raise `ValueError` for anything else."""
+        number = isinstance(value, int if kind is int else int | float)
+        if number and not isinstance(value, bool) and self.holds(value):
+            return kind(value)
+        # Python refuses to write integers of more than 4300 digits
+        huge = isinstance(value, int) and abs(value) >= 2**64
+        given = "an integer of more than 64 bits" if huge else shortened(value)
+        what = "a whole number" if kind is int else "a number"
+        raise ValueError(f"{given}; expected {what} {self}")
+
+
+def bounds_of(kind: object) -> Bounds | None:
+    """Return the bounds in the annotation of a type, such as `Length | None`, if it has any."""
+    if isinstance(kind, Bounds):
+        return kind
+    return next(filter(None, map(bounds_of, get_args(kind))), None)
+
+
+Number = Annotated[float, Bounds(-1e12, 1e12)]
+"""Number of any sign, such as the value of a parameter in SI units."""
+Positive = Annotated[float, Bounds(1e-12, 1e12)]
+"""Positive number, such as a standard deviation or the inertia of a rotor."""
+NotNegative = Annotated[float, Bounds(0, 1e12)]
+"""Positive number, or 0."""
+Part = Annotated[float, Field(ge=0, lt=1, strict=True)]
+"""Fraction of a whole, at least 0 and below 1 [1]."""
+Length = Annotated[float, Bounds(1e-4, 1e3, "m")]
+"""Length of a part of a robot [m]."""
+Coordinate = Annotated[float, Bounds(-1e8, 1e8, "m")]
+"""Coordinate of a place on a floor, such as an easting of UTM [m]."""
+CellLength = Annotated[float, Bounds(1e-5, 1, "m")]
+"""Edge length of a cell of a map, or of a pixel on a floor [m]."""
+Degrees = Annotated[float, Bounds(-3600, 3600, "deg")]
+"""Angle [deg]."""
+Mass = Annotated[float, Bounds(1e-6, 1e7, "kg")]
+"""Mass of a robot, or of a part of it [kg]."""
+Speed = Annotated[float, Bounds(1e-4, 100, "m/s")]
+"""Speed of a robot [m/s]."""
+Seconds = Annotated[float, Bounds(1e-6, 1e6, "s")]
+"""Duration [s]."""
+GearRatio = Annotated[float, Bounds(1e-3, 1e5)]
+"""Turns of the motor per turn of the wheel [1]."""
+TicksPerTurn = Annotated[float, Bounds(0.1, 1e9)]
+"""Ticks of an encoder per turn [1]."""
+Scale = Annotated[float, Bounds(1e-18, 1e18, of_size=True)]
+"""Factor on the numbers of a column, of either sign [1]."""
+Offset = Annotated[float, Bounds(-1e20, 1e20)]
+"""Number that is added to those of a column, such as nanoseconds since 1970."""
+Seed = Annotated[int, Bounds(0, 2**63 - 1)]
+"""Seed of random numbers."""
+
+
+def path_text(text: str) -> str:
+    """Return a path in a config; raise `ValueError` if no file can have this path."""
+    names = text.replace("\\", "/").split("/")
+    if not 0 < len(text) <= LONGEST_PATH or not text.isprintable():
+        raise ValueError(
+            f"{shortened(text)}; expected a path of 1 to {LONGEST_PATH} printable characters"
+        )
+    if max(len(name.encode()) for name in names) > LONGEST_NAME:
+        raise ValueError(f"{shortened(text)}; expected names of at most {LONGEST_NAME} bytes")
+    return text
+
+
+def inside(text: str) -> str:
+    """Return a path, or a glob, relative to a folder; raise `ValueError` if it leaves the folder.
+
+    Links that were made inside the folder may lead elsewhere.
+    """
+    parts = path_text(text).replace("\\", "/").split("/")
+    if parts[0] in ("", "~") or parts[0].endswith(":") or ".." in parts:
+        raise ValueError(f"{shortened(text)} leaves its folder; expected a path inside the folder")
+    if set(parts) <= {"", "."}:
+        raise ValueError(f"{shortened(text)} is the folder itself; expected files inside it")
+    return text
+
+
+PathText = Annotated[str, AfterValidator(path_text)]
+"""Path of a file, relative or absolute."""
+InsidePath = Annotated[str, AfterValidator(inside)]
+"""Path of a file inside a folder, relative to it."""
