@@ -23,6 +23,7 @@ from slipid.support.quantities import (
     Degrees,
     GearRatio,
     InsidePath,
+    Label,
     Length,
     Mass,
     Number,
@@ -274,12 +275,12 @@ class LogsSection(Section):
     """
 
     glob: InsidePath
-    format: str
-    surface: str = "folder"
+    format: Label
+    surface: Label = "folder"
     map: PathText | None = None
-    load: str = "as_built"
+    load: Label = "as_built"
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
-    session_name: str | None = Field(default=None, min_length=1)
+    session_name: Label | None = None
     min_rows: Annotated[int, Bounds(2, 1e9)] = 2
     end_poses: InsidePath | None = None
 
@@ -356,7 +357,7 @@ class WeightsSection(Section):
 
     std_kg: Mass
     kg: list[Mass] | None = None
-    like: str | None = None
+    like: Label | None = None
     mass_kg: Annotated[float, Bounds(-1e7, 1e7, "kg")] | None = None
     place_m: tuple[Place, Place] | None = None
 
@@ -432,13 +433,13 @@ class SelftestSection(Section):
             parameters.
     """
 
-    surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
+    surfaces: list[Label] = Field(default=["firm", "soft"], min_length=1)
     headings: Annotated[int, Bounds(1, 360)] = 12
     speeds_m_s: list[Speed] = Field(default=[0.1, 0.2], min_length=1)
     turns: Annotated[int, Bounds(0, 1000)] = 2
     distance_m: Annotated[float, Bounds(1e-3, 1e4, "m")] = 0.7
     truth: dict[str, Numbers] = Field(default_factory=dict)
-    wanted: list[str] | None = None
+    wanted: list[Label] | None = None
 
 
 class ConfigContent(Section):

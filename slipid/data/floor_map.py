@@ -17,7 +17,7 @@ from pydantic import Field
 from slipid.support.errors import DataError
 from slipid.support.extras import require
 from slipid.support.files import write_bytes
-from slipid.support.quantities import CellLength, Coordinate, InsidePath
+from slipid.support.quantities import CellLength, Coordinate, InsidePath, Label
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
 SCHEMA = "slipid.map/1"
@@ -172,7 +172,7 @@ def _few(cells: int) -> None:
 class PatchTable(Section):
     """One `[[patch]]` table of a map file: a polygon of one surface on top of the base."""
 
-    surface: str
+    surface: Label
     polygon: list[Point] = Field(min_length=3)
 
 
@@ -183,7 +183,7 @@ class PatchedFile(Section):
     """
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
-    base: str
+    base: Label
     extent_m: Extent
     cell_m: CellLength = 0.005
     patch: list[PatchTable] = Field(default_factory=list)
@@ -194,7 +194,7 @@ class PicturedFile(Section):
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
     picture: InsidePath
-    colours: dict[str, Colour] = Field(min_length=1)
+    colours: dict[Label, Colour] = Field(min_length=1)
     metres_per_pixel: CellLength
     corner_m: Point = (0.0, 0.0)
 

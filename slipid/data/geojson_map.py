@@ -16,7 +16,7 @@ from slipid.data.floor_map import MOST_CELLS, Colour, Extent, FloorMap
 from slipid.support.content import Content
 from slipid.support.errors import bad_data
 from slipid.support.files import read_json, write_json
-from slipid.support.quantities import Bounds, CellLength, Coordinate, Number
+from slipid.support.quantities import Bounds, CellLength, Coordinate, Label, Number
 from slipid.support.toml_file import Section, checked
 
 EXPECTED = "a floor map (slipid.map/2) that `slipid map` wrote"
@@ -62,8 +62,8 @@ class MapRegion(Section):
     schema_: Literal["slipid.map/2"] = Field(default="slipid.map/2", alias="schema")
     extent_m: Extent
     cell_m: CellLength
-    base: str
-    colours: dict[str, Colour] = Field(min_length=1)
+    base: Label
+    colours: dict[Label, Colour] = Field(min_length=1)
     picture_sha256: str
     unknown_share: Annotated[float, Bounds(0, 1)]
     notes: list[str]
@@ -107,7 +107,7 @@ class _Geometry(Section):
 
 
 class _Properties(Section):
-    surface: str
+    surface: Label
     area_m2: Annotated[float, Bounds(0, 1e16, "m^2")]
     colour: Colour
     confidence: Number | None
@@ -152,7 +152,10 @@ def read_polygons(path: Path) -> FloorMap:
     if rows * columns > MOST_CELLS:
         raise bad_data(path, f"{rows * columns} cells", f"at most {MOST_CELLS}")
     cells = np.full((rows, columns), -1, np.intp)
-    for feature in given.features:
+    for k, feature in enumerate(given.features, start=1):
+        if any(ring[0] != ring[-1] for ring in feature.geometry.coordinates):
+            expected = "the first corner as the last, in every ring of GeoJSON"
+            raise bad_data(path, f"features[{k}]: a ring that is not closed", expected)
         corners = (np.array(ring, float)[:-1] for ring in feature.geometry.coordinates)
         rings = [(ring - (low_x, low_y)) / region.cell_m for ring in corners]
         cells[covered(rings, rows, columns)] = names.index(feature.properties.surface)

@@ -88,6 +88,14 @@ def refused_as(path: Path | str, expected: str) -> Iterator[None]:
         raise bad_data(path, f"cannot be read ({text})", expected) from error
 
 
+def shown(value: object) -> str:
+    """Return a value as messages show it; Python itself writes no integers of over 4300 digits."""
+    try:
+        return repr(value)
+    except ValueError:
+        return "an integer of thousands of digits"
+
+
 def did_you_mean(name: object, choices: Iterable[str]) -> str:
     """Return `, did you mean this or that?` with the choices most similar to a name.
 

@@ -5,11 +5,12 @@ beyond them is a slip of the pen or another unit, and would only overflow later,
 """
 
 from dataclasses import dataclass
-from reprlib import repr as shortened
 from typing import Annotated, Any, get_args
 
 from pydantic import AfterValidator, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
+
+from slipid.support.errors import shown
 
 LONGEST_PATH = 300
 """Largest number of characters of a path or glob in a config."""
@@ -56,11 +57,8 @@ class Bounds:
         number = isinstance(value, int if kind is int else int | float)
         if number and not isinstance(value, bool) and self.holds(value):
             return kind(value)
-        # Python refuses to write integers of more than 4300 digits
-        huge = isinstance(value, int) and abs(value) >= 2**64
-        given = "an integer of more than 64 bits" if huge else shortened(value)
         what = "a whole number" if kind is int else "a number"
-        raise ValueError(f"{given}; expected {what} {self}")
+        raise ValueError(f"{shown(value)}; expected {what} {self}")
 
 
 def bounds_of(kind: object) -> Bounds | None:
@@ -104,15 +102,17 @@ Seed = Annotated[int, Bounds(0, 2**63 - 1)]
 """Seed of random numbers."""
 
 
+LONGEST_LABEL = 100
+"""Largest number of characters of a name in a config."""
+
+
 def path_text(text: str) -> str:
     """Return a path in a config; raise `ValueError` if no file can have this path."""
     names = text.replace("\\", "/").split("/")
     if not 0 < len(text) <= LONGEST_PATH or not text.isprintable():
-        raise ValueError(
-            f"{shortened(text)}; expected a path of 1 to {LONGEST_PATH} printable characters"
-        )
+        raise ValueError(f"{text!r}; expected a path of 1 to {LONGEST_PATH} printable characters")
     if max(len(name.encode()) for name in names) > LONGEST_NAME:
-        raise ValueError(f"{shortened(text)}; expected names of at most {LONGEST_NAME} bytes")
+        raise ValueError(f"{text!r}; expected names of at most {LONGEST_NAME} bytes")
     return text
 
 
@@ -123,12 +123,21 @@ def inside(text: str) -> str:
     """
     parts = path_text(text).replace("\\", "/").split("/")
     if parts[0] in ("", "~") or parts[0].endswith(":") or ".." in parts:
-        raise ValueError(f"{shortened(text)} leaves its folder; expected a path inside the folder")
+        raise ValueError(f"{text!r} leaves its folder; expected a path inside the folder")
     if set(parts) <= {"", "."}:
-        raise ValueError(f"{shortened(text)} is the folder itself; expected files inside it")
+        raise ValueError(f"{text!r} is the folder itself; expected files inside it")
     return text
 
 
+def label(text: str) -> str:
+    """Return a name in a config; raise `ValueError` if it is empty, long or not printable."""
+    if not 0 < len(text) <= LONGEST_LABEL or not text.isprintable():
+        raise ValueError(f"{text!r}; expected a name of 1 to {LONGEST_LABEL} printable characters")
+    return text
+
+
+Label = Annotated[str, AfterValidator(label)]
+"""Name of a floor, load set-up, session or layout."""
 PathText = Annotated[str, AfterValidator(path_text)]
 """Path of a file, relative or absolute."""
 InsidePath = Annotated[str, AfterValidator(inside)]

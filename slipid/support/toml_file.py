@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from slipid.support.content import Content
-from slipid.support.errors import DataError, did_you_mean
+from slipid.support.errors import DataError, did_you_mean, shown
 from slipid.support.files import read_bytes
 from slipid.support.parsing import Step, spelled, toml_of
 
@@ -83,8 +83,8 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
     if kind == "value_error":
         return f"{where}: {context['error']}"
     if kind == "literal_error":
-        return f"{where}: {given!r}; expected one of {context['expected']}"
-    return f"{where}: {given!r}; expected: {error['msg'][0].lower()}{error['msg'][1:]}"
+        return f"{where}: {shown(given)}; expected one of {context['expected']}"
+    return f"{where}: {shown(given)}; expected: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 
 def _steps(mapping: object, loc: Sequence[Step], missing: bool) -> list[Step]:

@@ -128,10 +128,25 @@ def test_friction_behind_a_gear_is_known_to_30_percent(tmp_path):
     assert np.log(high / low) / (2 * Z95) == pytest.approx(0.3, rel=1e-3)
 
 
-@pytest.mark.parametrize("ends", [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0,), None])
-def test_an_interval_that_is_none_is_refused(tmp_path, ends):
-    content = {"motor.resistance": {"verdict": "weak", "interval90": ends}}
+@pytest.mark.parametrize(
+    ("name", "value", "ends", "message"),
+    [
+        ("resistance", 1.0, (0.0, 1.0), "interval from 0.0 to 1.0"),
+        ("resistance", 1.0, (-1.0, 1.0), "interval from -1.0 to 1.0"),
+        ("resistance", 1.0, (2.0, 1.0), "interval from 2.0 to 1.0"),
+        ("resistance", 1.0, (1.0,), "not enough values"),
+        ("resistance", 1.0, None, "no interval"),
+        ("resistance", 1.0, (1.0, 1e19), r"1e\+19; expected a number from"),
+        ("resistance", 1.0, (1.0, None), "None; expected a number from"),
+        ("resistance", None, (0.5, 1.0), "None; expected a number from"),
+        ("resistance", 1e19, (0.5, 1.0), r"1e\+19; expected a number from"),
+        ("brush_shape", 0.5, (0.5, 3.0), "interval from 0.5 to 3.0"),
+    ],
+)
+def test_a_number_or_interval_that_is_none_is_refused(tmp_path, name, value, ends, message):
+    number = {"value": value, "verdict": "weak", "interval90": ends}
+    content = {f"motor.{name}": number}
     text = {"schema": "slipid.identified/1", "drive": "motor", "parameters": content}
     (tmp_path / "motor.json").write_text(json.dumps(text))
-    with pytest.raises(DataError, match=r"motor.json: damaged"):
+    with pytest.raises(DataError, match=rf"motor.json: damaged \(motor.{name}: .*{message}"):
         bench_priors(parsed(tmp_path / "robot.toml", ROBOT), 16.0)

@@ -115,28 +115,32 @@ def test_other_drives(tmp_path, section, wheels, grips):
             "",
             ["robot.drive: missing", "omni, mecanum, skid, differential, steered, general"],
         ),
-        ("gear_ratio = 16", "gear_ratio = -16", ["robot.gear_ratio: -16", "greater than 0"]),
+        (
+            "gear_ratio = 16",
+            "gear_ratio = -16",
+            ["robot.gear_ratio: -16", "a number from 0.001 to 100000"],
+        ),
         ("gear_ratio = 16", 'gear_ratio = "16:1"', ["robot.gear_ratio: '16:1'", "number"]),
         ("mass_kg = 12.0", "mass_kg = nan", ["robot.mass_kg: nan", "finite"]),
         (
             "mass_kg = 12.0",
             "mass_kg = 12.0\nlimits = { speed_m_s = 0, speed = 1 }",
-            ["robot.limits.speed_m_s: 0", "greater than 0", "speed: no such key, did you mean"],
+            ["robot.limits.speed_m_s: 0", "to 50 m/s", "speed: no such key, did you mean"],
         ),
         (
             "mass_kg = 12.0",
             "mass_kg = 12.0\nlimits = { wheel_speed_rad_s = 4000 }",
-            ["robot.limits.wheel_speed_rad_s: 4000", "less than or equal to 1000"],
+            ["robot.limits.wheel_speed_rad_s: 4000", "from 0.001 to 1000 rad/s"],
         ),
         (
             "mass_kg = 12.0",
             "mass_kg = 12.0\nsensors = { gyro_std_rad_s = -1 }\nactuators = { lag_s = -1 }",
-            ["robot.sensors.gyro_std_rad_s: -1", "robot.actuators.lag_s: -1", "or equal to 0"],
+            ["robot.sensors.gyro_std_rad_s: -1", "robot.actuators.lag_s: -1", "from 0 to 5 s"],
         ),
         ("[60, 180, 300]", "[60, 180]", ["robot.wheel_azimuths_deg", "at least 3"]),
         ("[[logs]]", "[[log]]", ["log: no such key", "did you mean logs", "logs: missing"]),
         ("glob =", "globb =", ["logs[1].globb: no such key", "mean glob", "logs[1].glob: missing"]),
-        ("std = 0.01", "std = -0.01", ['"camera.lag".prior.std: -0.01', "greater than 0"]),
+        ("std = 0.01", "std = -0.01", ['"camera.lag".prior.std: -0.01', "a number from 1e-12"]),
         ("fixed = 0.001", "fixd = 0.001", ['"surface.*.lead".fixd', "did you mean fixed"]),
         (
             "fixed = 0.001",
@@ -277,7 +281,7 @@ def test_no_log_at_all_names_what_is_there(tmp_path):
         ("mean = 0.05", "mean = [0.05, 0.1]", "camera.lag: 2 values; expected 1"),
         ('"robotino2022"', '"robotino22"', "no such layout, did you mean robotino2022"),
         ("[60, 180, 300]", "[0, 90, 180, 270]", "4 wheels, but one_surface/gray/exp07.csv has 3"),
-        ("one_surface", "/one_surface", "logs.glob '/one_surface/"),
+        ("one_surface", "/one_surface", "logs[1].glob: '/one_surface/*/*.csv' leaves its folder"),
     ],
 )
 def test_config_and_logs_must_fit_each_other(tmp_path, old, new, expected):

@@ -37,7 +37,7 @@ def test_options_alone_ask_nothing(tmp_path):
     before = out.read_bytes()
     bad = invoke(*words, "--force", "--mass-kg", -1)
     assert bad.exit_code == 2
-    assert "--mass-kg '-1': expected a number above 0" in bad.stderr
+    assert "--mass-kg '-1': expected a number from 1e-06" in bad.stderr
     assert out.read_bytes() == before
 
 

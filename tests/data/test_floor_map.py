@@ -126,7 +126,7 @@ def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
         (('base = "table"', ""), "base: missing; expected a value"),
         (("extent_m = [0.0, 0.0, 1.0, 1.0]", ""), "extent_m: missing; expected a value"),
         (("[0.0, 0.0, 1.0, 1.0]", "[1.0, 0.0, 0.0, 1.0]"), "expected lowest x, lowest y"),
-        (("cell_m = 0.01", "cell_m = 0"), "cell_m: 0; expected: input should be greater than 0"),
+        (("cell_m = 0.01", "cell_m = 0"), "cell_m: 0; expected a number from 1e-05 to 1 m"),
         (
             ("cell_m = 0.01", "cells_m = 0.01"),
             "cells_m: no such key, did you mean cell_m.*one of schema",
@@ -140,6 +140,11 @@ def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
         (("schema", "= ="), "not valid TOML"),
         (("polygon", "polygn"), r"patch\[1\].polygn: no such key, did you mean polygon"),
         (("cell_m = 0.01", "cell_m = 0.0001"), "100000000 cells; expected at most"),
+        (
+            ("[0.0, 0.0, 1.0, 1.0]", "[0.0, 0.0, 1e9, 1.0]"),
+            r"extent_m\[3\]: 1000000000.0; expected",
+        ),
+        (("[0.2, 0.2]", "[1e9, 0.2]"), r"patch\[1\].polygon\[1\]\[1\]: 1000000000.0; expected"),
     ],
 )
 def test_errors_of_a_map_are_named(tmp_path, change, match):
@@ -159,6 +164,9 @@ def test_absent_and_broken_pictures_are_named(tmp_path):
     text = 'schema = "slipid.map/1"\npicture = "top.png"\nmetres_per_pixel = 0.1\n'
     path.write_text(text)
     with pytest.raises(DataError, match="colours: missing"):
+        read_map(path)
+    path.write_text(text.replace("top.png", "../top.png") + '[colours]\na = "#ff0000"\n')
+    with pytest.raises(DataError, match=r"picture: '\.\./top\.png' leaves its folder"):
         read_map(path)
     path.write_text(text + '[colours]\na = "red"\n')
     with pytest.raises(DataError, match=r"colours\.a: 'red'"):
@@ -252,7 +260,7 @@ def test_cells_are_covered_by_their_middles():
         (('"slipid.map/2"', '"slipid.map/3"'), r"slipid\.schema: 'slipid.map/3'; expected one of"),
         (('"FeatureCollection"', '"Feature"'), "type: 'Feature'; expected one of 'FeatureColl"),
         (('"Polygon"', '"Point"'), r"features\[1\]\.geometry\.type: 'Point'; expected one of"),
-        (('"cell_m": 0.1', '"cell_m": 0'), r"slipid\.cell_m: 0; expected: input should be gr"),
+        (('"cell_m": 0.1', '"cell_m": 0'), r"slipid\.cell_m: 0; expected a number from 1e-05"),
         (('"cell_m": 0.1', '"cell_m": 0.0001'), "100000000 cells; expected at most"),
         (('"cell_m": 0.1', '"cell": 0.1'), r"slipid\.cell: no such key, did you mean cell_m"),
         (
@@ -260,6 +268,9 @@ def test_cells_are_covered_by_their_middles():
             "no colour of sand; expected every surface in the key 'colours'",
         ),
         (('"confidence": 2.5', '"confidence": NaN'), "NaN is not a number"),
+        (('"cell_m": 0.1', '"cell_m": 1e-19'), r"slipid\.cell_m: 1e-19; expected a number from"),
+        (("1.0,\n   1.0\n", "1e19,\n   1.0\n"), r"slipid\.extent_m\[3\]: 1e\+19; expected"),
+        (("0.6,\n       0.2\n", "1e19,\n       0.2\n"), r"coordinates\[\d\]\[\d\]\[1\]: 1e\+19"),
         (('"colour": "#808080"', '"colour": "gray"'), r"properties\.colour: 'gray'; expected"),
         (('"type": "Feature"', '"type" "Feature"'), "not valid JSON"),
     ],
@@ -286,6 +297,10 @@ def test_geojson_without_a_map_is_refused(tmp_path):
     with pytest.raises(DataError, match="no polygon lies within extent_m; expected coord"):
         read_map(path)
     low = vector_map(ringed("table", WHOLE)).to_json()
+    low["features"][0]["geometry"]["coordinates"][0].append([0.5, 0.5])
+    path.write_text(json.dumps(low))
+    with pytest.raises(DataError, match=r"features\[1\]: a ring that is not closed"):
+        read_map(path)
     low["slipid"]["extent_m"] = [1.0, 0.0, 0.0, 1.0]
     path.write_text(json.dumps(low))
     with pytest.raises(DataError, match="expected lowest x, lowest y, highest x, highest y"):

@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
-from reprlib import repr as shortened
 
 import numpy as np
 
@@ -115,7 +114,7 @@ def _number(path: Path, row: int, cells: dict[str, str], column: str) -> float:
         value = float("inf")
     if text and not abs(value) <= _LARGEST:
         expected = f"a number of at most {_LARGEST:g}, or nothing"
-        raise bad_data(path, shortened(text), expected, row=row, column=column)
+        raise bad_data(path, repr(text), expected, row=row, column=column)
     return value
 
 

@@ -14,14 +14,13 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.units import converts, factor
-from slipid.support.errors import did_you_mean
+from slipid.support.errors import did_you_mean, shown
 from slipid.support.quantities import (
     Bounds,
     CellLength,
     GearRatio,
     Length,
     Offset,
-    Positive,
     Scale,
     Seconds,
     TicksPerTurn,
@@ -146,11 +145,11 @@ class SensorLayout:
     ticks_are_increments: StrictBool = False
     tick_bits: Annotated[int, Bounds(1, 64)] = 32
     current_is_signed: StrictBool = True
-    torque_constant: Positive | None = None
+    torque_constant: Annotated[float, Bounds(1e-6, 1e4, "N m/A")] | None = None
     wheel_radius: Length | None = None
     max_gap: Seconds = 1.0
-    max_pose_jump: Positive = 0.5
-    max_heading_jump: Positive = 1.6
+    max_pose_jump: Annotated[float, Bounds(1e-6, 1e6, "m")] = 0.5
+    max_heading_jump: Annotated[float, Bounds(1e-6, 1e6, "rad")] = 1.6
 
     def factor(self, channel: str, unit: str) -> float:
         """Return the factor from a unit to the SI unit of a channel.
@@ -260,4 +259,5 @@ class Layout(SensorLayout):
 def unknown(what: str, name: object, choices: Iterable[str]) -> str:
     """Return a message about a name that is not among the choices: similar ones, then all."""
     names = list(choices)
-    return f"no {what} '{name}'{did_you_mean(name, names)}; expected one of {', '.join(names)}"
+    text = name if isinstance(name, str) else shown(name)
+    return f"no {what} '{text}'{did_you_mean(text, names)}; expected one of {', '.join(names)}"

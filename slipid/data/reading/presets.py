@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SINGLE, Channel, Layout, unknown
 from slipid.data.reading.units import same_unit
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, shown
 from slipid.support.quantities import inside
 from slipid.support.toml_file import checked
 
@@ -187,7 +187,7 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
     others = given.pop("beside", {})
     if not isinstance(others, dict) or not all(isinstance(v, dict) for v in others.values()):
         raise DataError(
-            f"{where} beside: {others!r}; expected a table of layouts, keyed by file names"
+            f"{where} beside: {shown(others)}; expected a table of layouts, keyed by file names"
         )
     layout = _declared_file(given, where)
     beside = dict(layout.beside)
@@ -214,7 +214,7 @@ def _declared_file(table: Mapping[str, object], where: str) -> Layout:
             known = ["format", "columns", "beside", *_SETTINGS]
             raise DataError(f"{where}: {unknown('key', key, known)}")
     if not isinstance(columns, dict):
-        raise DataError(f"{where} columns: {columns!r}; expected a table of channels")
+        raise DataError(f"{where} columns: {shown(columns)}; expected a table of channels")
     base = Layout({}) if name is None else PRESETS[name]
     channels = dict(base.channels)
     for channel, spec in columns.items():

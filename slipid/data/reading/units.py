@@ -3,7 +3,6 @@
 import re
 from contextlib import suppress
 from functools import lru_cache
-from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Any
 
 from slipid.support.errors import did_you_mean
@@ -72,13 +71,13 @@ def factor(unit: str, target: str) -> float:
     text = _ALIASES.get(unit.strip(), unit.strip())
     known = f"{did_you_mean(unit[:40], KNOWN)} (known: {', '.join(KNOWN)})"
     if not _GRAMMAR.fullmatch(text):
-        raise ValueError(f"unknown unit {shortened(unit)}{known}")
+        raise ValueError(f"unknown unit '{unit}'{known}")
     registry = _registry()
     wanted = registry.parse_units(_ALIASES.get(target, target))
     try:
         given = registry.parse_units(text)
     except Exception as error:  # pint raises many types of errors, even from tokenize
-        raise ValueError(f"unknown unit {shortened(unit)}{known}") from error
+        raise ValueError(f"unknown unit '{unit}'{known}") from error
     if given.dimensionality != wanted.dimensionality:
         raise ValueError(f"unit '{unit}' cannot be converted to {target}")
     return float(registry.Quantity(1.0, given).to(wanted).magnitude)

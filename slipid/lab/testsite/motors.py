@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic.dataclasses import dataclass
 
-from slipid.support.quantities import Bounds, NotNegative, Positive
+from slipid.support.quantities import Bounds
 from slipid.support.toml_file import CLOSED
 
 
@@ -24,15 +24,15 @@ class MotorBuild:
         ticks_per_revolution: encoder ticks per turn of the motor shaft.
     """
 
-    resistance_ohm: Positive = 5.5
-    inductance_h: Positive = 8.9e-3
-    back_emf_vs: Positive = 0.0514
-    rotor_inertia_kg_m2: Positive = 7.1e-6
-    coulomb_nm: NotNegative = 0.07
-    viscous_nms: NotNegative = 0.006
+    resistance_ohm: Annotated[float, Bounds(1e-6, 1e6, "ohm")] = 5.5
+    inductance_h: Annotated[float, Bounds(1e-9, 1e3, "H")] = 8.9e-3
+    back_emf_vs: Annotated[float, Bounds(1e-6, 1e4, "V s/rad")] = 0.0514
+    rotor_inertia_kg_m2: Annotated[float, Bounds(1e-12, 1e6, "kg m^2")] = 7.1e-6
+    coulomb_nm: Annotated[float, Bounds(0, 1e6, "N m")] = 0.07
+    viscous_nms: Annotated[float, Bounds(0, 1e6, "N m s")] = 0.006
     efficiency: Annotated[float, Bounds(1e-3, 1)] = 0.9
-    supply_v: Positive = 24.0
-    supply_ohm: NotNegative = 0.15
+    supply_v: Annotated[float, Bounds(0.1, 1e4, "V")] = 24.0
+    supply_ohm: Annotated[float, Bounds(0, 1e3, "ohm")] = 0.15
     ticks_per_revolution: Annotated[int, Bounds(10, 1e9)] = 2000
 
 
@@ -51,11 +51,11 @@ class SpeedLoop:
     """
 
     kind: Literal["pi", "feed_forward", "cascade"] = "pi"
-    gain: NotNegative = 0.08
-    integral: NotNegative = 0.8
-    current_gain: NotNegative = 4.0
-    current_limit_a: Positive = 3.0
-    filter_s: NotNegative = 0.004
+    gain: Annotated[float, Bounds(0, 1e6)] = 0.08
+    integral: Annotated[float, Bounds(0, 1e6)] = 0.8
+    current_gain: Annotated[float, Bounds(0, 1e6)] = 4.0
+    current_limit_a: Annotated[float, Bounds(1e-3, 1e5, "A")] = 3.0
+    filter_s: Annotated[float, Bounds(0, 10, "s")] = 0.004
 
 
 class WheelDrives:

@@ -9,7 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from slipid.lab.testsite.robot_build import RobotBuild
 from slipid.support.content import Content
-from slipid.support.quantities import Bounds, Degrees, Length, NotNegative, Positive
+from slipid.support.quantities import Bounds, Degrees, Length
 from slipid.support.toml_file import CLOSED
 
 
@@ -38,9 +38,9 @@ class OmniBuild(RobotBuild):
     rollers: Annotated[int, Bounds(6, 100), Field(multiple_of=2)] = 12
     roller_radius_m: Length = 0.009
     roller_mass_kg: Annotated[float, Bounds(1e-4, 1e3, "kg")] = 0.012
-    row_offset_m: NotNegative = 0.006
-    mount_n_m: Positive = 2e4
-    roller_friction_nm: NotNegative = 0.012
+    row_offset_m: Annotated[float, Bounds(0, 1, "m")] = 0.006
+    mount_n_m: Annotated[float, Bounds(1, 1e12, "N/m")] = 2e4
+    roller_friction_nm: Annotated[float, Bounds(0, 1e3, "N m")] = 0.012
 
     def __post_init__(self) -> None:
         if self.roller_radius_m >= self.wheel_radius_m:

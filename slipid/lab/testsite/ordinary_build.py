@@ -8,7 +8,7 @@ from pydantic.dataclasses import dataclass
 
 from slipid.lab.testsite.robot_build import RobotBuild
 from slipid.support.content import Content
-from slipid.support.quantities import Bounds, Coordinate, Length, Mass, NotNegative
+from slipid.support.quantities import Bounds, Coordinate, Length, Mass
 from slipid.support.toml_file import CLOSED
 
 IMPEDANCE = 0.1
@@ -43,7 +43,7 @@ class OrdinaryBuild(RobotBuild):
     castor_m: tuple[Coordinate, Coordinate] | None = None
     castor_radius_m: Length = 0.02
     castor_mass_kg: Mass = 0.1
-    castor_friction_nm: NotNegative = 0.005
+    castor_friction_nm: Annotated[float, Bounds(0, 1e3, "N m")] = 0.005
     wheel_width_m: Length = 0.03
     radius_error: tuple[RadiusError, RadiusError] = (0.0, 0.0)
 

@@ -14,7 +14,7 @@ from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.ordinary_build import OrdinaryBuild
 from slipid.lab.testsite.surfaces import SURFACES, SurfacePhysics
 from slipid.support.content import Content
-from slipid.support.quantities import Bounds, Coordinate, NotNegative, Part, Positive, Seconds
+from slipid.support.quantities import Bounds, Coordinate, Part, Seconds
 from slipid.support.toml_file import CLOSED
 
 Interval = Annotated[float, Bounds(1e-3, 1, "s")]
@@ -51,28 +51,28 @@ class SiteSensors:
 
     row_s: Interval = 0.031
     row_jitter: Part = 0.1
-    current_step_a: Positive = 1 / 39
-    current_noise_a: NotNegative = 0.05
+    current_step_a: Annotated[float, Bounds(1e-9, 1e3, "A")] = 1 / 39
+    current_noise_a: Annotated[float, Bounds(0, 1e3, "A")] = 0.05
     current_is_signed: bool = False
-    speed_step: Positive = 2.83
-    speed_gain: Positive = 1.013
+    speed_step: Annotated[float, Bounds(1e-9, 1e3, "rad/s")] = 2.83
+    speed_gain: Annotated[float, Bounds(1e-3, 1e3)] = 1.013
     voltage: bool = True
     duty: bool = False
     bus_voltage: bool = False
     gyro: bool = False
     voltage_step_v: Annotated[float, Bounds(0.01, 1e3, "V")] = 0.1
-    voltage_noise_v: NotNegative = 0.05
-    gyro_noise: NotNegative = 0.004
-    gyro_bias: NotNegative = 0.005
+    voltage_noise_v: Annotated[float, Bounds(0, 1e3, "V")] = 0.05
+    gyro_noise: Annotated[float, Bounds(0, 100, "rad/s")] = 0.004
+    gyro_bias: Annotated[float, Bounds(0, 100, "rad/s")] = 0.005
     average_s: Annotated[float, Bounds(0, 1, "s")] = 0.008
     frame_s: Interval = 1 / 29
     lag_s: Seconds = 0.056
     camera_scale: Annotated[float, Bounds(1e-3, 100)] = 1.117
-    camera_noise_m: NotNegative = 0.0005
-    camera_noise_rad: NotNegative = 0.004
+    camera_noise_m: Annotated[float, Bounds(0, 100, "m")] = 0.0005
+    camera_noise_rad: Annotated[float, Bounds(0, 10, "rad")] = 0.004
     dropout: Part = 0.01
     outlier: Part = 0.0005
-    outlier_m: NotNegative = 0.03
+    outlier_m: Annotated[float, Bounds(0, 1e3, "m")] = 0.03
 
     def __post_init__(self) -> None:
         if not 0.5 * self.frame_s <= self.lag_s <= 0.4:

@@ -49,8 +49,8 @@ class SurfacePhysics:
 
     friction: Annotated[float, Bounds(1e-3, 10)] = 0.8
     rolling_m: Annotated[float, Bounds(0, 0.05, "m")] = 0.0003
-    softness_m: Annotated[float, Bounds(1e-6, 0.03, "m")] = 0.0003
-    shear_n_m: Annotated[float, Bounds(50, 1e9, "N/m")] = 1e5
+    softness_m: Annotated[float, Bounds(1e-9, 0.03, "m")] = 0.0003
+    shear_n_m: Annotated[float, Bounds(50, 1e12, "N/m")] = 1e5
     compaction: Annotated[float, Bounds(0, 1e7, "N/m^1.5")] = 0.0
     body_drag_n: Annotated[float, Bounds(0, 1000, "N")] = 0.0
     rib_height_m: Annotated[float, Bounds(0, 0.02, "m")] = 0.0

@@ -50,6 +50,9 @@ def generic(root, **changes):
         ("%", "1", 0.01),
         ("ticks", "tick", 1.0),
         ("pix", "pixel", 1.0),
+        ("N·m", "N*m", 1.0),
+        ("m s^-1", "m/s", 1.0),
+        ("km * s**-1", "m/s", 1e3),
     ],
 )
 def test_factors(unit, target, expected):
@@ -74,6 +77,13 @@ def test_units_agree_with_pints_own_registry():
         ("rad/ss", "rad/s", "did you mean rad/s"),
         ("", "m", "cannot be converted"),
         ("m^", "m", "unknown unit"),
+        ("10**10**10", "s", r"unknown unit '10\*\*10\*\*10'"),
+        ("s**2**9", "s", "unknown unit"),
+        ("s**10", "s", "unknown unit"),
+        ("10 s", "s", "unknown unit"),
+        ("(s)", "s", "unknown unit"),
+        ("*".join("m" * 7), "m", "unknown unit"),
+        ("__import__('os')", "s", "unknown unit"),
     ],
 )
 def test_units_that_are_refused(unit, target, message):
@@ -121,9 +131,9 @@ def test_a_config_starts_from_a_preset_and_overrides_it(root):
         ({"format": "robotino"}, "no format 'robotino', did you mean robotino20"),
         ({}, "no columns; expected a table of channels"),
         ({"format": "robotino2022", "gear_ration": 3}, "no key 'gear_ration', did you mean gear_"),
-        ({"format": "robotino2022", "gear_ratio": 0}, "gear_ratio: 0; .*greater than 0"),
-        ({"format": "robotino2022", "gear_ratio": "16"}, "gear_ratio: '16'; .*valid number"),
-        ({"format": "robotino2022", "names_row": True}, "names_row: True; .*valid integer"),
+        ({"format": "robotino2022", "gear_ratio": 0}, "gear_ratio: 0; expected a number from"),
+        ({"format": "robotino2022", "gear_ratio": "16"}, "gear_ratio: '16'; expected a number"),
+        ({"format": "robotino2022", "names_row": True}, "names_row: True; expected a whole number"),
         ({"format": "robotino2022", "delimiter": ";;"}, "delimiter: ';;'; .*at most 1 char"),
         ({"format": "robotino2022", "new_run": "often"}, "new_run: 'often'; .*time_restarts"),
         (
@@ -132,7 +142,7 @@ def test_a_config_starts_from_a_preset_and_overrides_it(root):
         ),
         (
             {"format": "robotino2022", "metres_per_pixel": [1, -1]},
-            "metres_per_pixel.2.: -1; .*greater than 0",
+            "metres_per_pixel.2.: -1; expected a number from",
         ),
         ({"format": "robotino2022", "columns": {"time": False}}, "no time column"),
         ({"format": "robotino2022", "columns": {"pose_x": False}}, "only one of pose_x and"),
@@ -168,7 +178,7 @@ def test_a_config_starts_from_a_preset_and_overrides_it(root):
             },
             "columns.gyro: sign: no such key; expected one of columns, unit, scale",
         ),
-        ({**GENERIC_LAYOUT, "ticks_per_revolution": 0.0}, "greater than 0"),
+        ({**GENERIC_LAYOUT, "ticks_per_revolution": 0.0}, "0.0; expected a number from 0.1"),
         (
             {k: v for k, v in GENERIC_LAYOUT.items() if k != "ticks_per_revolution"},
             "wheel_ticks without ticks_per_revolution",

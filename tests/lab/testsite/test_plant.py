@@ -420,15 +420,15 @@ def test_the_same_seed_drives_the_same_run():
         ),
         (
             lambda: MotorBuild(resistance_ohm=0.0),
-            r"resistance_ohm\s+Input should be greater than 0",
+            r"resistance_ohm\s+Value error, .*expected a number from 1e-12",
         ),
         (
             lambda: MotorBuild(efficiency=1.2),
-            r"efficiency\s+Input should be less than or equal to 1",
+            r"efficiency\s+Value error, 1.2; expected a number from 0.001 to 1",
         ),
-        (lambda: SurfacePhysics(friction=float("nan")), r"friction\s+Input"),
+        (lambda: SurfacePhysics(friction=float("nan")), r"friction\s+Value error, nan; expected"),
         (lambda: SurfacePhysics(colour="red"), r"colour\s+.*pattern"),
-        (lambda: SpeedLoop(gain=-1.0), r"gain\s+Input should be greater than or equal to 0"),
+        (lambda: SpeedLoop(gain=-1.0), r"gain\s+Value error, -1.0; expected a number from 0"),
     ],
 )
 def test_numbers_that_make_no_robot_are_refused(make, match):

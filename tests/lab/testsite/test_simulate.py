@@ -1,12 +1,14 @@
 """`slipid simulate`: files, seeds, interrupts, mistakes; and a camera with readable frames."""
 
 import hashlib
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -20,16 +22,21 @@ from slipid.cli.main import app
 from slipid.data.floor_map import four_zones, read_map
 from slipid.data.reading.presets import declared_layout, preset
 from slipid.lab.testsite.config import all_filmed, can_identify, identify_config, plan
+from slipid.lab.testsite.motors import MotorBuild, SpeedLoop
 from slipid.lab.testsite.omni_build import OmniBuild
+from slipid.lab.testsite.ordinary_build import OrdinaryBuild
+from slipid.lab.testsite.sections import SimulationContent
 from slipid.lab.testsite.simulate import SiteTask, _log_path, simulate, truth
-from slipid.lab.testsite.site import Site, SiteCamera
+from slipid.lab.testsite.site import Site, SiteCamera, SiteSensors
 from slipid.lab.testsite.studio import MARKER, Studio, film
 from slipid.lab.testsite.surfaces import SURFACES
 from slipid.support.errors import DataError
 from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
+from slipid.support.toml_file import checked
 from tests.conftest import ROOT
 from tests.helpers.floors import surface_at
+from tests.helpers.nonsense import refuse_nonsense
 from tests.helpers.one_log import read_log
 
 SMALL = """
@@ -228,7 +235,7 @@ def test_the_configs_that_ship_are_good(path):
         (("distance_m = 0.1", "distance_m = inf"), "distance_m: inf"),
         (
             ("rolling_m = 0.002", "body_drag_n = 1e9"),
-            r"body_drag_n: 1000000000\.0; expected: input should be less than or equal to 1000",
+            r"body_drag_n: 1000000000\.0; expected a number from 0 to 1000 N",
         ),
         (
             (
@@ -252,6 +259,42 @@ def test_mistakes_are_named_with_their_key(tmp_path, change, match):
     with pytest.raises(DataError, match=match) as error:
         plan(tmp_path / "site.toml", text)
     assert str(error.value).startswith(str(tmp_path / "site.toml"))
+
+
+def test_every_number_of_the_site_has_bounds(tmp_path):
+    runs = [
+        {"kind": "headings", "surface": "a", "step_deg": 9, "first_deg": 1, "distance_m": 1},
+        {"kind": "curves", "surface": "a", "count": 1, "speeds_m_s": [0.1], "distance_m": 1},
+        {"kind": "paper_grid", "surface": "a", "seconds": 1},
+        {"kind": "arcs", "surface": "a", "curvatures_1_m": [0.5], "speeds_m_s": [-0.1]},
+        {"kind": "spins", "surface": "a", "rates_deg_s": [-40.0], "angle_deg": 9},
+        {"kind": "paths", "surface": "a", "seed": 1, "count": 1, "legs": 1, "turn_deg_s": 9},
+        {"kind": "wander", "map": "p", "count": 1, "points": 1},
+        {"kind": "rectangle", "map": "p", "repeats": 1, "speed_m_s": 0.1},
+    ]
+    parts = {"motor": MotorBuild(), "speed_loop": SpeedLoop(), "sensors": SiteSensors()}
+    parts |= {"robot": OmniBuild(), "camera": SiteCamera()}
+    content = {key: json.loads(json.dumps(asdict(part))) for key, part in parts.items()}
+    content["surfaces"] = {"a": asdict(SURFACES["ribbed"])}
+    content["maps"] = {"p": {"kind": "patchwork", "surfaces": ["a"], "seed": 1, "half_m": 1.0}}
+    content |= {"seed": 0, "heading_jitter_deg": 5, "command_delay_s": 0.1, "runs": runs}
+
+    def read(mapping):
+        return checked("site.toml", mapping, SimulationContent)
+
+    assert refuse_nonsense(content, read, set()) > 90
+    for drive in ({"wheelbase_m": 0.3}, {"drive": "differential", "castor_m": [-0.2, 0.0]}):
+        robot = asdict(OrdinaryBuild(**{"centres_m": {"b": (-0.01, 0.0)}, **drive}))
+        robot = {key: one for key, one in robot.items() if one is not None}
+        one = {"robot": json.loads(json.dumps(robot)), "runs": runs[:1]}
+        assert refuse_nonsense(one, read, {"wheelbase_m", "castor_m"}) > 15
+
+
+def test_a_jitter_of_minus_0_is_0(tmp_path):
+    found = [
+        plan(tmp_path / "x", f"heading_jitter_deg = {zero}\n{SMALL}") for zero in ("-0.0", "0")
+    ]
+    assert found[0].runs[0][1].start == found[1].runs[0][1].start
 
 
 def test_a_bad_config_ends_with_2_and_a_line(tmp_path):

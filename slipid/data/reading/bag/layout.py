@@ -52,7 +52,7 @@ class TopicChannel:
     topics: Annotated[Texts, Field(min_length=1, validation_alias=AliasChoices("topics", "topic"))]
     fields: Annotated[Texts, Field(validation_alias=AliasChoices("fields", "field"))] = ()
     unit: StrictStr | None = None
-    scale: Annotated[tuple[Scale, ...], BeforeValidator(several)] = (1.0,)
+    scale: Annotated[tuple[Scale, ...], BeforeValidator(several), Field(min_length=1)] = (1.0,)
     offset: Offset = 0.0
     frame: StrictStr | None = None
     child: StrictStr | None = None
