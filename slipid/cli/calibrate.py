@@ -39,8 +39,8 @@ def calibrate(
         str | None,
         option("9x6", "Number of inner corners of a plain chessboard, instead of --board."),
     ] = None,
-    square: Annotated[float | None, option("M", "Edge length of a square, in m.")] = None,
-    marker: Annotated[float | None, option("M", "Edge length of a marker, in m.")] = None,
+    square: Annotated[float | None, option("M", "Edge length of a square, in m.", max=100)] = None,
+    marker: Annotated[float | None, option("M", "Edge length of a marker, in m.", max=100)] = None,
     dictionary: Annotated[
         str, option("NAME", "Name of the dictionary of the board's markers.")
     ] = "4X4_50",
@@ -58,7 +58,8 @@ def calibrate(
         Path | None, option("PICTURE", "Picture in which the board lies on the floor.")
     ] = None,
     board_height: Annotated[
-        float, option("M", "Height of the board's printed face above the floor, in m.")
+        float,
+        option("M", "Height of the board's printed face above the floor, in m.", min=-100, max=100),
     ] = 0.0,
     points: Annotated[
         Path | None,
@@ -66,19 +67,29 @@ def calibrate(
     ] = None,
     size_std: Annotated[
         float | None,
-        option("PART", "Relative standard deviation of the measured lengths; 0.001 by default."),
+        option(
+            "PART",
+            "Relative standard deviation of the measured lengths; 0.001 by default.",
+            min=0,
+            max=1,
+        ),
     ] = None,
     metres_per_pixel: Annotated[
         float | None,
-        option("M", "Length of a pixel on the floor, in m, if nothing was calibrated."),
+        option("M", "Length of a pixel on the floor, in m, if nothing was calibrated.", max=1),
     ] = None,
     lens_height: Annotated[
         float | None,
-        option("M", "Height of the lens above the floor, in m; with --metres-per-pixel."),
+        option("M", "Height of the lens above the floor, in m; with --metres-per-pixel.", max=1000),
     ] = None,
     turn: Annotated[
         float | None,
-        option("DEG", "Rotation of the world's axes, in deg; with --metres-per-pixel."),
+        option(
+            "DEG",
+            "Rotation of the world's axes, in deg; with --metres-per-pixel.",
+            min=-3600,
+            max=3600,
+        ),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,

@@ -5,7 +5,7 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, NamedTuple, ParamSpec
@@ -60,8 +60,11 @@ MaybeOut = Annotated[
 ]
 Load = Annotated[str | None, option("NAME", "Name of the load set-up; the first by default.")]
 Jobs = Annotated[
-    int | None, typer.Option(min=1, help="Number of parallel processes; by default one per core.")
+    int | None,
+    typer.Option(min=1, max=1024, help="Number of parallel processes; by default one per core."),
 ]
+MOST_SEED = 2**32 - 1
+"""Largest seed of random numbers."""
 Json = Annotated[
     str | None, option("FILE", "Also write the result as JSON to this file; - for stdout.")
 ]
@@ -109,6 +112,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
             _check_json(options.get("json"))
+            _refuse_nan(options)
             code = command(*args, **options)
         except KeyboardInterrupt:
             typer.echo(
@@ -142,6 +146,13 @@ def _check_json(name: object) -> None:
         target_of(Path(name))
     except DataError as error:
         raise DataError(f"--json {error}, or - for standard output") from error
+
+
+def _refuse_nan(options: Mapping[str, object]) -> None:
+    """Raise `DataError` for an option that is NaN, which is within any limits of Typer."""
+    for name, value in options.items():
+        if isinstance(value, float) and value != value:
+            raise DataError(f"--{name.replace('_', '-')}: nan; expected a number")
 
 
 def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Next, Out, Quiet, emit, executor_of, guarded, option
+from slipid.cli.common import MOST_SEED, Next, Out, Quiet, emit, executor_of, guarded, option
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.extras import MissingExtra
@@ -34,7 +34,8 @@ def demo(
         option("NAME", "`recorded` for logs that ship with slipid, `mujoco` to simulate new ones."),
     ] = "recorded",
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the simulation, with --plant mujoco.")
+        int | None,
+        typer.Option(min=0, max=MOST_SEED, help="Seed of the simulation, with --plant mujoco."),
     ] = None,
     quiet: Quiet = False,
 ) -> int:

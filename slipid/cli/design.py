@@ -46,7 +46,8 @@ def design(
         str | None, option("LIST", "Turning rates of candidate runs in deg/s, such as -40,0,40.")
     ] = None,
     distance: Annotated[
-        float | None, option("M", "Length of a run in m; by default that of the logged runs.")
+        float | None,
+        option("M", "Length of a run in m; by default that of the logged runs.", max=10_000),
     ] = None,
     floor: Annotated[
         list[str] | None,

@@ -31,7 +31,9 @@ def export(
     path: Annotated[
         str, option("NAME", "Path that the example program in C follows.")
     ] = "rectangle",
-    speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
+    speed: Annotated[
+        float, option("M_S", "Speed along the path, in m/s.", min=1e-3, max=100)
+    ] = 0.2,
     load: Load = None,
     floors: Annotated[
         str, option("NAMES", "Floors that can occur, separated by commas; all by default.")

@@ -37,17 +37,21 @@ def motor(
     bus: Annotated[Column, _column("Column with the bus voltage, in V; with --duty.")] = None,
     pole_pairs: Annotated[
         float | None,
-        option("NUMBER", "Pole pairs of the motor, if the speed is electrical (erpm).", min=1),
+        option(
+            "NUMBER", "Pole pairs of the motor, if the speed is electrical (erpm).", min=1, max=1000
+        ),
     ] = None,
     gear: Annotated[
-        float, option("RATIO", "Motor turns per turn of the sensor of speed, angle or pulses.")
+        float,
+        option("RATIO", "Motor turns per turn of the sensor of speed, angle or pulses.", max=1e5),
     ] = 1.0,
     pulses: Annotated[
         Column,
         _column("Column with a tachometer's count or level; with a unit of time: pulse times."),
     ] = None,
     pulses_per_revolution: Annotated[
-        float | None, option("NUMBER", "Pulses per turn of the tachometer; with --pulses.")
+        float | None,
+        option("NUMBER", "Pulses per turn of the tachometer; with --pulses.", max=1e6),
     ] = None,
     ignore: Annotated[
         list[str] | None, option("NAME", "Column that is not guessed to be a channel; repeatable.")

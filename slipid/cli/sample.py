@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from slipid.cli.common import (
+    MOST_SEED,
     Json,
     Next,
     OutFolder,
@@ -29,19 +30,24 @@ def sample(
     draws: Annotated[
         int,
         typer.Option(
-            min=10, help="Number of draws to keep from each of the four ensembles of chains."
+            min=10,
+            max=1_000_000,
+            help="Number of draws to keep from each of the four ensembles of chains.",
         ),
     ] = 400,
-    most: Annotated[int, typer.Option(min=40, help="Largest number of blocks of steps.")] = 400,
+    most: Annotated[
+        int, typer.Option(min=40, max=1_000_000, help="Largest number of blocks of steps.")
+    ] = 400,
     block: Annotated[
         int,
         typer.Option(
             min=1,
+            max=10_000,
             hidden=True,
             help="Number of steps per block; the chain is saved after each block.",
         ),
     ] = 20,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 0,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:

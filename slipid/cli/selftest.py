@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import ConfigFile, Json, Next, Out, Quiet, emit, for_robots, option
+from slipid.cli.common import (
+    MOST_SEED,
+    ConfigFile,
+    Json,
+    Next,
+    Out,
+    Quiet,
+    emit,
+    for_robots,
+    option,
+)
 from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
@@ -17,8 +27,12 @@ def selftest(
         Path | None, option("DIR", "Folder of logs whose wheel motion is used in the simulation.")
     ] = None,
     out: Out = Path("selftest_out"),
-    replicates: Annotated[int, typer.Option(min=1, help="Number of simulated experiments.")] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random true values and noise.")] = 0,
+    replicates: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Number of simulated experiments.")
+    ] = 8,
+    seed: Annotated[
+        int, typer.Option(min=0, max=MOST_SEED, help="Seed of the random true values and noise.")
+    ] = 0,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:

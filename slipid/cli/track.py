@@ -26,22 +26,28 @@ def track(
     camera: Annotated[Path, option("FILE", "Camera file of `slipid calibrate`.")],
     out: Annotated[Path, option("FILE", "File of poses to write (.csv or .parquet).")],
     marker_size: Annotated[
-        float | None, option("M", "Edge length of the marker's black square, in m.")
+        float | None, option("M", "Edge length of the marker's black square, in m.", max=100)
     ] = None,
     marker_height: Annotated[
-        float | None, option("M", "Height of the marker above the floor, in m.")
+        float | None, option("M", "Height of the marker above the floor, in m.", min=-100, max=100)
     ] = None,
     marker_yaw: Annotated[
         float,
         option(
             "DEG",
             "Direction of the marker's top edge, in deg counter-clockwise from the robot's x axis.",
+            min=-3600,
+            max=3600,
         ),
     ] = 0.0,
     dictionary: Annotated[str, option("NAME", "Name of the dictionary of the marker.")] = "4X4_50",
     id: Annotated[
         int | None,
-        typer.Option(min=0, help="Id of the marker; by default that of the only visible marker."),
+        typer.Option(
+            min=0,
+            max=1_000_000,
+            help="Id of the marker; by default that of the only visible marker.",
+        ),
     ] = None,
     targets: Annotated[
         Path | None,
@@ -50,7 +56,8 @@ def track(
         ),
     ] = None,
     fps: Annotated[
-        float | None, option("HZ", "Frame rate, in Hz; by default the times in the video are used.")
+        float | None,
+        option("HZ", "Frame rate, in Hz; by default the times in the video are used.", max=1e6),
     ] = None,
     times: Annotated[
         Path | None, option("FILE", "CSV file of the frame times, with columns frame and time [s].")
@@ -59,14 +66,17 @@ def track(
         str | None, option("X0,Y0,X1,Y1", "Part of the picture in which to search, in pixels.")
     ] = None,
     seconds: Annotated[
-        float | None, option("S", "Duration of the recording in s; required for a camera device.")
+        float | None,
+        option("S", "Duration of the recording in s; required for a camera device.", max=1e6),
     ] = None,
     preview: Annotated[
         Path | None, option("FILE", "Picture to write, with the poses of one frame drawn in it.")
     ] = None,
     preview_frame: Annotated[
         int | None,
-        option("N", "Frame to draw in --preview; by default the first with a pose.", min=0),
+        option(
+            "N", "Frame to draw in --preview; by default the first with a pose.", min=0, max=10**9
+        ),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,

@@ -53,11 +53,15 @@ def trial(
             "Path: rectangle, circle, eight, clothoid, or turning (omni robots that also rotate).",
         ),
     ] = "rectangle",
-    speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
+    speed: Annotated[
+        float, option("M_S", "Speed along the path, in m/s.", min=1e-3, max=100)
+    ] = 0.2,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Number of start poses.")] = 20,
     rest: Annotated[
         float,
-        option("S", "Rest before the robot drives, 0 to 60 s, in which a gyro's bias is found."),
+        option(
+            "S", "Rest before the robot drives, in which a gyro's bias is found.", min=0, max=60
+        ),
     ] = 5.0,
     load: Load = None,
     jobs: Jobs = None,

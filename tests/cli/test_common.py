@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import math
 import shlex
 import sys
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 import typer
@@ -14,6 +17,7 @@ from slipid.cli import common
 from slipid.cli.common import Next, can_draw, emit, program
 from slipid.cli.main import app
 from slipid.support.progress import Reporter
+from tests.helpers.shared import invoke
 
 GROUP = typer.main.get_command(app)
 NEXT = Next("look for mistakes in the logs", ("check", Path("my robot.toml"), "--data", "logs"))
@@ -22,6 +26,27 @@ NEXT = Next("look for mistakes in the logs", ("check", Path("my robot.toml"), "-
 def shown(capsys, out=None, written=(), to=None, following=(NEXT,), show=lambda page: None):
     emit(to, {"value": 1.5}, show, following, out, written)
     return capsys.readouterr().out
+
+
+def test_every_number_of_the_command_line_has_a_largest_value():
+    count = 0
+    for name, command in GROUP.commands.items():
+        hints = get_type_hints(inspect.unwrap(command.callback), include_extras=True)
+        for option, hint in hints.items():
+            kind, *info = get_args(hint) or (hint,)
+            if {float, int} & {kind, *get_args(kind)} and option != "return":
+                assert 1 <= info[0].max <= 2**32, (name, option)
+                count += 1
+    assert count > 25
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "1e308", "-1"])
+def test_a_number_beyond_its_limits_is_refused(tmp_path, text, capsys):
+    assert invoke("trial", tmp_path, "--speed", text).exit_code == 2
+    with pytest.raises(typer.Exit) as caught:  # versions of Typer differ in what they let through
+        common.guarded(lambda **options: 0)(top_speed=math.nan)
+    assert caught.value.exit_code == 2
+    assert capsys.readouterr().err == "--top-speed: nan; expected a number\n"
 
 
 def test_the_page_is_named_first_and_the_others_below(capsys):

@@ -77,8 +77,8 @@ class MotorOptions:
             ("--gear", self.gear_ratio),
             ("--pulses-per-revolution", self.pulses_per_revolution),
         ):
-            if value is not None and not 0.0 < value < 1e6:
-                raise DataError(f"{option}: {value:g}; expected a number above 0 and below 1e6")
+            if value is not None and not 1e-6 < value < 1e6:
+                raise DataError(f"{option}: {value:g}; expected a number above 1e-6 and below 1e6")
 
 
 def given_columns(text: str, channel: str) -> GivenColumns:

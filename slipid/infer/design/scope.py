@@ -14,15 +14,15 @@ MOST_SPEEDS = 4
 """Largest number of candidate speeds of a floor."""
 
 
-def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float, ...] | None:
+def _numbers(name: str, text: str | None, least: float = -3600.0) -> tuple[float, ...] | None:
     if text is None:
         return None
     try:
         found = tuple(float(x) for x in text.split(","))
     except ValueError:
         found = ()
-    if not found or not np.isfinite(found).all() or min(found) < least:
-        rule = "numbers" if least < 0 else f"numbers of at least {least:g}"
+    if not 0 < len(found) <= 100 or not all(least <= number <= 3600 for number in found):
+        rule = f"1 to 100 numbers from {least:g} to 3600"
         raise DataError(f"--{name} {text}: expected {rule} separated by commas, as in 0,45,90")
     return tuple(dict.fromkeys(found))
 
@@ -63,8 +63,8 @@ class Scope:
     loads: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        if self.length is not None and not 0 < self.length < np.inf:
-            raise DataError(f"--distance {self.length:g}: expected a positive length in metres")
+        if self.length is not None and not 1e-3 <= self.length <= 1e4:
+            raise DataError(f"--distance {self.length:g}: expected a length of 0.001 to 10000 m")
         self._known("floor", self.floors, self.fit.validity)
         self._known("load set-up", self.loads, self.fit.robot.body.loads)
 
@@ -136,7 +136,7 @@ class Scope:
         floor, _, load = head.partition("@")
         try:
             numbers = [float(x) for x in rest]
-            ok = len(rest) < 3 and np.isfinite(numbers).all() and (not rest or numbers[0] > 0)
+            ok = len(rest) < 3 and (np.abs(numbers) <= 3600).all() and (not rest or numbers[0] > 0)
         except ValueError:
             ok = False
         if not ok:

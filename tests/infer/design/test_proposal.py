@@ -143,9 +143,9 @@ def test_an_unreachable_goal_exits_with_1_and_names_the_channel(folder):
         (("--predict", "blue:0.1"), "no floor 'blue'; identified: soft"),
         (("--predict", "soft@heavy"), "no load set-up 'heavy'; identified: as_built"),
         (("--floor", "blue"), "no floor 'blue'"),
-        (("--speeds", "-0.1"), "numbers of at least 0"),
-        (("--headings", "north"), "expected numbers separated by commas"),
-        (("--distance", "0"), "expected a positive length in metres"),
+        (("--speeds", "-0.1"), "1 to 100 numbers from 0 to 3600"),
+        (("--headings", "north"), "expected 1 to 100 numbers from -3600 to 3600 sep"),
+        (("--distance", "0"), "expected a length of 0.001 to 10000 m"),
         (("--speeds", "0", "--turns", "0"), "no candidate run remains"),
     ],
 )
