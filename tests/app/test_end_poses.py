@@ -93,14 +93,13 @@ def test_headings_of_turns_alone_show_the_track(squares):
         (lambda c: [["floor/00.csv", "1 m", "", "0"], *c[1:]], "row 2, column 'x_m': '1 m'; exp"),
         (lambda c: [["floor/00.csv", "1e9", "", "0"], *c[1:]], "row 2, column 'x_m': '1e9'; exp"),
         (lambda c: [["floor/00.csv", "nan", "", "0"], *c[1:]], "row 2, column 'x_m': 'nan'; exp"),
-        (lambda c: [["floor/00.csv", "x" * 200_000, "", "0"], *c[1:]], ": not readable as text"),
         (lambda c: [["floor/00.csv", "", "", ""], *c[1:]], "row 2: no coordinate is known at both"),
         (lambda c: [[*c[0][:3], "3"], *c[1:]], "row 2, column 'heading_deg': the heading changes"),
     ],
 )
 def test_what_is_wrong_in_a_table_is_named(squares, change, message):
     folder, lines = squares
-    with pytest.raises(DataError, match=rf"ends\.csv ?{message}"):
+    with pytest.raises(DataError, match=rf"ends\.csv {message}"):
         task_of(folder, change(lines))
 
 

@@ -121,7 +121,8 @@ def test_options_that_cannot_be(made, words, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     done = track(made, made.video("robot", ROBOT), tmp_path / "p.csv", *SIZES[words])
     assert done.exit_code == 2
-    assert words in done.stderr
+    # some versions of Typer refuse what is no number by themselves, without showing it
+    assert words.removesuffix(" nan").removesuffix(" inf") in done.stderr
 
 
 def test_sources_that_cannot_be_read(made, tmp_path):

@@ -420,7 +420,7 @@ def test_the_same_seed_drives_the_same_run():
         ),
         (
             lambda: MotorBuild(resistance_ohm=0.0),
-            r"resistance_ohm\s+Value error, .*expected a number from 1e-12",
+            r"resistance_ohm\s+Value error, .*expected a number from 1e-06",
         ),
         (
             lambda: MotorBuild(efficiency=1.2),
