@@ -71,7 +71,7 @@ def with_session_effects(
     for _ in range(ROUNDS):
         variance = _variances(model, w, keep, _weights(model, by_axis(variance, "session", w)))
     weighted = np.swapaxes(model.effect, 1, 2) @ np.linalg.solve(model.scale, model.slope)
-    scores = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
+    scores = weighted * _weights(model, np.zeros_like(model.run))[:, None, None]
     of_session = by_axis(variance, "session", w)
     meat = np.zeros_like(model.covariance)
     of_segment = list(zip(w.surface, w.session, strict=True))

@@ -18,9 +18,10 @@ from slipid.lab.selftest.logs import (
     simulate_logs,
     true_robot,
 )
-from slipid.predict import fitted_slip_model, folds
+from slipid.predict import fitted_slip_model, folds, predictive
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import FittedSlipModel
+from slipid.predict.predictive import force_balance_of
 from slipid.predict.selection import contact_errors, selection_folds
 from slipid.search_space import Choice
 
@@ -176,6 +177,22 @@ def test_what_runs_of_a_floor_share_moves_with_no_number_of_another_floor(learnt
         slope = learnt.models[0].shared[floor].by_number
         assert not slope[..., space.where(lambda e, f=other: e.surface == f)].any()
         assert slope[..., space.where(lambda e, f=floor: e.surface == f)].any()
+
+
+def test_how_uncertain_other_directions_are_is_estimated_from_fitted_runs(
+    learnt, judged, monkeypatch
+):
+    counted, of_axes = [], predictive.axis_effects
+
+    def spied(objective, motion, keep, *more):
+        counted.append(np.asarray(keep))
+        return of_axes(objective, motion, keep, *more)
+
+    monkeypatch.setattr(predictive, "axis_effects", spied)
+    problem, optimum = learnt.problem, learnt.optimum
+    keep = (~np.isin(problem.windows.run, judged)).astype(float)
+    force_balance_of(problem, optimum.state, optimum.covariance, keep)
+    np.testing.assert_array_equal(counted, [keep])
 
 
 def test_a_step_without_a_fold_uses_nothing_of_it(logs, learnt):
