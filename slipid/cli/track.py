@@ -26,10 +26,10 @@ def track(
     camera: Annotated[Path, option("FILE", "Camera file of `slipid calibrate`.")],
     out: Annotated[Path, option("FILE", "File of poses to write (.csv or .parquet).")],
     marker_size: Annotated[
-        float | None, option("M", "Edge length of the marker's black square, in m.", max=100)
+        float | None, option("M", "Edge length of the marker's black square, in m.", max=1e6)
     ] = None,
     marker_height: Annotated[
-        float | None, option("M", "Height of the marker above the floor, in m.", min=-100, max=100)
+        float | None, option("M", "Height of the marker above the floor, in m.", min=-1e6, max=1e6)
     ] = None,
     marker_yaw: Annotated[
         float,

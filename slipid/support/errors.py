@@ -90,10 +90,12 @@ def refused_as(path: Path | str, expected: str) -> Iterator[None]:
 
 def shown(value: object) -> str:
     """Return a value as messages show it; Python itself writes no integers of over 4300 digits."""
+    if isinstance(value, int) and value.bit_length() > 64:
+        return f"a whole number of {value.bit_length()} bits"
     try:
         return repr(value)
     except ValueError:
-        return "an integer of thousands of digits"
+        return "a value with an integer of thousands of digits"
 
 
 def did_you_mean(name: object, choices: Iterable[str]) -> str:

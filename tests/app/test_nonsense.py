@@ -125,6 +125,7 @@ def test_every_number_of_a_layout_has_bounds():
     [
         ("ticks_per_revolution", 1e-320, "1e-320; expected a number from 0.1 to 1e+09"),
         ("tick_bits", 100_000, "tick_bits: 100000; expected a whole number from 1 to 64"),
+        ("tick_bits", 10**400, "tick_bits: a whole number of 1329 bits; expected a whole number"),
         ("tick_bits", 32.0, "tick_bits: 32.0; expected a whole number"),
         ("format", [], "no format '[]'"),
         ("beside", {"../poses.csv": {}}, "beside: '../poses.csv' leaves its folder"),

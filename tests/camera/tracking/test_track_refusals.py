@@ -94,7 +94,7 @@ SIZES = {
     "--marker-size nan": ("--marker-size", "nan", "--marker-height", 0.25),
     "--marker-height inf": ("--marker-size", 0.131, "--marker-height", "inf"),
     "10 at most": ("--marker-size", 131, "--marker-height", 0.25),
-    "1000 at most": ("--marker-size", 0.131, "--marker-height", 1e308),
+    "1000 at most": ("--marker-size", 0.131, "--marker-height", 131_000),
     "--marker-yaw nan": (*LONE, "--marker-yaw", "nan"),
     "--id 50; expected 0 to 49": (*LONE, "--id", 50),
     "below the camera": ("--marker-size", 0.131, "--marker-height", 1.7),
