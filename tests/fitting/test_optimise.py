@@ -17,6 +17,7 @@ from slipid.fitting import problem as of_problem
 from slipid.fitting import variances
 from slipid.fitting.optimise import (
     LinearisedResiduals,
+    _floors_fitted,
     _stacked,
     levenberg,
     optimise,
@@ -291,6 +292,20 @@ def test_left_out_runs_are_as_good_as_absent(truth, surface_problem):
     subset = optimise(alone, start=begin(alone), **PRECISE)
     np.testing.assert_allclose(masked.state.z, subset.state.z, atol=1e-4)
     np.testing.assert_allclose(masked.covariance, subset.covariance, rtol=0.01, atol=1e-9)
+
+
+def test_no_bit_of_the_start_of_a_floor_depends_on_left_out_runs(surface_problem):
+    """Neither where each floor starts nor the loss by which that was chosen."""
+    w, keep = surface_problem.windows, np.ones(48)
+    keep[::4] = 0.0
+    noise = np.random.default_rng(2).normal(size=w.pose.shape)
+    odd = replace(w, pose=np.where(keep[:, None, None], w.pose, noise))
+    (one, loss), (other, loss_of_other) = (
+        _floors_fitted(p, keep, lambda _: None, p.space.start, "")
+        for p in (surface_problem, surface_problem.of(odd))
+    )
+    np.testing.assert_array_equal(other.z, one.z)
+    assert loss_of_other == loss
 
 
 def test_a_run_gone_wrong_hardly_counts(surface_problem, surface_fit):
