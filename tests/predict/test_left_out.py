@@ -179,6 +179,15 @@ def test_what_runs_of_a_floor_share_moves_with_no_number_of_another_floor(learnt
         assert slope[..., space.where(lambda e, f=floor: e.surface == f)].any()
 
 
+def test_a_fold_that_is_fitted_to_one_speed_holds_viscosities(logs, learnt):
+    task = task_of(logs)
+    one_speed = np.flatnonzero(folds.folds_of(task.dataset, "speeds") == 1)
+    held = partial(folds.fit_fold, fit=lambda *_, **__: learnt.optimum)
+    for judged, holds in ((one_speed, True), (one_speed[::2], False)):
+        found = held(task.problem(), CHOICES, task.dataset, "speeds", judged)
+        assert found.problem.space.held.any() == holds
+
+
 def test_how_uncertain_other_directions_are_is_estimated_from_fitted_runs(
     learnt, judged, monkeypatch
 ):
