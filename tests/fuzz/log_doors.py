@@ -17,6 +17,7 @@ from slipid.app.bench import read_motor_log
 from slipid.app.logs import unpack
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.end_poses import read_end_poses
+from slipid.data.reading.layout import CHANNELS
 from slipid.data.reading.motor_layout import MotorOptions, given_columns
 from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import read_logs
@@ -189,6 +190,8 @@ def _motor_columns(path: Path) -> Any:
     given = _values(path)
     if given is None or not all(isinstance(text, str) for text in given.values()):
         return None  # options are words
+    if not {*given} <= {*CHANNELS}:
+        return None  # there is no such option
     columns = {name: given_columns(text, name) for name, text in given.items()}
     return read_motor_log(HERE / "plain.csv", columns, None, MotorOptions()).records
 
