@@ -16,6 +16,7 @@ from slipid.data.runs import Runs
 from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration.result import ABSURD, Calibration
 from slipid.infer.fit_file import SCHEMA
+from slipid.infer.result_content import AGAIN, IdentifiedContent, checked_result
 from slipid.infer.result_folder import FIT, IDENTIFIED, files_of_fit, fit_of
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
 from slipid.model.geometry import Geometry
@@ -289,14 +290,13 @@ def read_calibration(out: Path) -> CalibrationFile:
         DataError: there is no such file, or no calibration in it.
     """
     fit_of(out)
-    content = read_json(out / IDENTIFIED, "a result of `slipid identify`")
-    try:
-        calibration, models = Calibration.of_json(content["calibration"]), content["selected_model"]
-        return CalibrationFile(calibration, models, tuple(content["data"]["runs"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{out / IDENTIFIED}: no calibration ({error}); run `slipid identify` again"
-        ) from error
+    path = out / IDENTIFIED
+    content = read_json(path, "a result of `slipid identify`")
+    found = checked_result(path, content, IdentifiedContent)
+    if found.calibration is None or not found.selected_model:
+        raise DataError(f"{path}: no calibration; {AGAIN}")
+    calibration = Calibration.of_json(content["calibration"])
+    return CalibrationFile(calibration, found.selected_model, tuple(found.data.runs))
 
 
 def write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:

@@ -14,6 +14,7 @@ from slipid.app.calibrate import calibrated, remarks, write_run
 from slipid.app.check import sanity
 from slipid.app.config import FitSection, read_config
 from slipid.app.floor_maps import map_files
+from slipid.app.logs import read_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.data.check.findings import wrong
 from slipid.fitting.multi_floor import multi_floor_runs
@@ -37,7 +38,7 @@ from slipid.predict.selection import (
 from slipid.predict.slip_models import slip_models
 from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
-from slipid.support.files import read_json, writable, write_json
+from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import COMPILING_S, Reporter
 
@@ -161,13 +162,13 @@ def checked_task(
 def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
     """Return a sentence if a folder has a fit of another config or of other logs, else None."""
     try:
-        before = read_json(out / "run.json", "what identify wrote")
-        config, data = before["config"], before["data"]
-    except (DataError, KeyError, TypeError):
+        before = read_run_file(out)
+    except DataError:
         return None
-    if config["sha256"] == task.config.hash and data["hash"] == task.data_hash:
+    same = before.config.sha256 == task.config.hash
+    if same and before.data.hash == task.data_hash:
         return None
-    other = "other logs" if config["sha256"] == task.config.hash else f"another {config['name']}"
+    other = "other logs" if same else f"another {before.config.name}"
     return f"{out} has a fit of {other}; it is replaced when this one is done"
 
 

@@ -23,6 +23,8 @@ from slipid.data.reading.reader import (
     without_beside,
 )
 from slipid.data.runs import Runs, collect, counted_once
+from slipid.infer.result_content import RunContent, checked_result
+from slipid.infer.result_folder import RUN
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError, bad_data, did_you_mean, refused_as
@@ -34,15 +36,26 @@ def log_folder(out: Path, data: Path | None) -> Path:
     """Return the folder of the logs: the given one, else the folder from which the fit read them.
 
     Raises:
-        DataError: the folder of the fit no longer exists.
+        DataError: run.json is damaged, or the folder in it no longer exists.
     """
     if data is not None:
         return data
-    run = read_json(out / "run.json", "the run.json that `slipid identify` writes")
-    folder = Path(run["data"]["folder"])
+    folder = Path(read_run_file(out).data.folder)
     if not folder.is_dir():
-        raise DataError(f"{folder}: the folder of the fitted logs is gone; expected --data DIR")
+        raise DataError(
+            f"{out / RUN}: the folder of the fitted logs, {folder}, is gone; expected --data DIR"
+        )
     return folder
+
+
+def read_run_file(out: Path) -> RunContent:
+    """Return what the run.json of a result folder says about config and logs.
+
+    Raises:
+        DataError: the file is absent or damaged.
+    """
+    content = read_json(out / RUN, "the run.json that `slipid identify` writes")
+    return checked_result(out / RUN, content, RunContent)
 
 
 def read_dataset(
@@ -258,7 +271,7 @@ def write_run_file(
         **more,
         "versions": versions(),
     }
-    write_json(out / "run.json", content)
+    write_json(out / RUN, content)
 
 
 RECORDED = Path(__file__).with_name("recorded.zip")

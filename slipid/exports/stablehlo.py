@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,16 +26,20 @@ from slipid.exports.text import template
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.interface import Readings
 from slipid.robot.robot_file import typed
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, refused_as
+from slipid.support.files import read_bytes
 from slipid.support.parsing import arrays_of, json_of
 
-SCHEMA = "slipid.stablehlo/2"
+SCHEMA = "slipid.stablehlo/3"
 TOLERANCE = 1e-9
 """Largest allowed difference between a number that the loaded program computes and the reference
 step, relative to the number's scale [1]."""
 PLATFORMS = ("cpu", "cuda", "tpu")
 """Platforms on which the programs run."""
-FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
+PROGRAMS = ("step.stablehlo", "step_batch.stablehlo")
+ABOUT, GOLDEN = "step.json", "golden.npz"
+FILES = (*PROGRAMS, ABOUT, GOLDEN)
+AGAIN = "export the robot again"
 
 
 @dataclass(frozen=True)
@@ -94,12 +99,16 @@ def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     arrays: dict[str, Any] = start | vars(golden(loop))
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
-    about = {"schema": SCHEMA, **asdict(_signature(loop))}
-    return {
+    content = {
         "step.stablehlo": bytes(one.serialize()),
         "step_batch.stablehlo": bytes(batch.serialize()),
-        "step.json": (json.dumps(about, indent=1) + "\n").encode(),
         "golden.npz": buffer.getvalue(),
+    }
+    sums = {name: hashlib.sha256(data).hexdigest() for name, data in content.items()}
+    about = {"schema": SCHEMA, "sha256": sums, **asdict(_signature(loop))}
+    return {
+        **content,
+        "step.json": (json.dumps(about, indent=1) + "\n").encode(),
         "README.md": template("stablehlo.md").encode(),
     }
 
@@ -129,32 +138,72 @@ def load_program(folder: Path | str) -> Program:
             reference steps.
     """
     place = Path(folder)
-    content = {}
-    for name in FILES:
-        try:
-            content[name] = (place / name).read_bytes()
-        except OSError as error:
-            raise DataError(f"{place / name}: {error.strerror}; export the robot again") from error
+    expected = f"a file of `slipid export`; {AGAIN}"
+    content = {name: read_bytes(place / name, expected) for name in FILES}
+    signature = _signature_in(place, content)
     try:
-        about = json_of(content["step.json"])
-        schema = about.pop("schema")
-        if schema != SCHEMA:
-            raise DataError(
-                f"{place / 'step.json'}: the schema is {schema}, but this version of slipid reads "
-                f"{SCHEMA}; update slipid, or export the robot again"
-            )
-        signature = typed(Signature, about)
-        arrays = arrays_of(content["golden.npz"])
-        start = [jnp.asarray(arrays[f"start{k}"]) for k in range(len(signature.state))]
-        programs = [export.deserialize(bytearray(content[name])) for name in FILES[:2]]
-        steps = Golden(arrays["given"], arrays["said"], arrays["command"])
-    except DataError:
-        raise
-    except Exception as error:  # three parsers (JSON, npz, StableHLO) raise many kinds of errors
-        raise DataError(f"{place}: damaged ({error}); export the robot again") from error
-    program = Program(signature, tuple(start), *programs)
+        arrays = arrays_of(content[GOLDEN])
+        start, steps = _start_and_steps(signature, arrays)
+    except ValueError as error:
+        raise DataError(f"{place / GOLDEN}: {error}; {AGAIN}") from error
+    programs = []
+    for name in PROGRAMS:
+        with refused_as(place / name, f"a program; {AGAIN}"):
+            programs.append(export.deserialize(bytearray(content[name])))
+    program = Program(signature, start, *programs)
     _check_results(program, steps, place)
     return program
+
+
+def _signature_in(place: Path, content: Mapping[str, bytes]) -> Signature:
+    """Return the signature in step.json, after a check of the hashes of the other files.
+
+    A program that was damaged could end the process that loads it, so its hash is compared first.
+
+    Raises:
+        DataError: step.json is damaged or of another version, or a file was changed.
+    """
+    path = place / ABOUT
+    try:
+        about = json_of(content[ABOUT])
+        schema = about.pop("schema", None) if isinstance(about, dict) else None
+        if schema != SCHEMA:
+            raise ValueError(
+                f"the schema is {schema}, but this version of slipid reads {SCHEMA}; update slipid"
+            )
+        sums, signature = about.pop("sha256", None), typed(Signature, about)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}, or {AGAIN}") from error
+    for name in (GOLDEN, *PROGRAMS):
+        found = hashlib.sha256(content[name]).hexdigest()
+        if not isinstance(sums, dict) or sums.get(name) != found:
+            raise DataError(f"{place / name}: changed, its hash differs from {ABOUT}; {AGAIN}")
+    return signature
+
+
+def _start_and_steps(
+    signature: Signature, arrays: Mapping[str, np.ndarray]
+) -> tuple[tuple[Array, ...], Golden]:
+    """Return the state at rest and the reference steps.
+
+    Raises:
+        ValueError: an array is absent or has another shape than by the signature.
+    """
+
+    def array(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        found = arrays.get(name, np.array("nothing"))
+        if found.dtype.kind not in "fiub" or found.shape != shape:
+            raise ValueError(f"array {name} of shape {found.shape}; expected {shape}")
+        return found
+
+    rows = len(np.atleast_1d(arrays.get("given", 0)))
+    fields = signature.said[:-1], signature.said[-1:]
+    said, command = (sum(field.size for field in some) for some in fields)
+    given = sum(field.size for field in signature.given)
+    state = enumerate(signature.state)
+    start = tuple(jnp.asarray(array(f"start{k}", field.shape)) for k, field in state)
+    names = {"given": given, "said": said, "command": command}
+    return start, Golden(**{name: array(name, (rows, n)) for name, n in names.items()})
 
 
 def _check_results(program: Program, steps: Golden, place: Path) -> None:

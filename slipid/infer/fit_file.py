@@ -21,6 +21,7 @@ from slipid.fitting.calibration.result import Calibration
 from slipid.fitting.shared_effects import FittedEffects, SpeedAndLoad
 from slipid.infer.held_out import HeldOut
 from slipid.infer.result import Channels, Fit
+from slipid.infer.result_content import AGAIN, FitContent, checked_result
 from slipid.infer.result_folder import FIT, IDENTIFIED, files_of_fit, fit_of
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.draws import Draws
@@ -32,7 +33,7 @@ from slipid.predict.selection import FloorSelection
 from slipid.search_space import Choice, Space, with_values
 from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import checksum, json_text, read_json, write_together
+from slipid.support.files import checksum, json_text, read_bytes, read_json, write_together
 from slipid.support.parsing import arrays_of
 
 _RESULT = "the result of `slipid identify`"
@@ -40,6 +41,7 @@ SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/9"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
 _SHARED = ("std", "coefs", "by_number", "covariance")
+_MIXED = ("mixed", "refused")
 _SHAPE = ("place", "drive_angle", "roller_angle", "grips", "drive_of", "gear_ratio")
 
 
@@ -79,12 +81,13 @@ def load(folder: Path) -> Fit:
         raise DataError(f"{path}: {what}; expected {SCHEMA_FIT}, {_RESULT} of this version")
     if content.pop("checksum", None) != checksum(content):
         raise DataError(f"{path}: damaged or edited, its checksum differs; expected {_RESULT}")
+    checked_result(path, content, FitContent)
+    arrays = _unpacked(folder, **content["arrays"])
     try:
-        fit = from_json(content, _unpacked(folder, **content["arrays"]))
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{path}: {error}; expected {_RESULT} of this version") from error
+        fit = from_json(content, arrays)
+        _check(fit)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}; {AGAIN}") from error
     fit_of(folder)
     return fit
 
@@ -103,15 +106,13 @@ def _packed(fit: Fit) -> bytes:
 def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
     """Return the arrays of a fit, after a check of the file's hash."""
     path = folder / file
-    try:
-        packed = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected the arrays of {FIT}") from error
+    packed = read_bytes(path, f"the arrays of {FIT}")
     if hashlib.sha256(packed).hexdigest() != sha256:
-        raise DataError(
-            f"{path}: damaged, its hash differs from the one in {FIT}; run `slipid identify` again"
-        )
-    return arrays_of(packed)
+        raise DataError(f"{path}: damaged, its hash differs from the one in {FIT}; {AGAIN}")
+    try:
+        return arrays_of(packed)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}; {AGAIN}") from error
 
 
 def identified_json(fit: Fit) -> Content:
@@ -215,6 +216,10 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
     space = Space(_robot_of(content["robot"]), choices)
     if space.names != content["names"]:
         raise ValueError("its parameters differ from those that this version declares")
+    n = space.size
+    for at, found in (("z", content["z"]), *_near(content["settings"])):
+        if len(found) != n:
+            raise ValueError(f"{at}: {len(found)} numbers; expected {n}, one per name")
     variances, settings = content["variances"], content["settings"]
     return Fit(
         space=space,
@@ -248,19 +253,65 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
             for path, (value, origin) in content.get("robot_settings", {}).items()
         },
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
-        held_out=HeldOut.of_json(content["held_out"]) if "held_out" in content else None,
+        held_out=content.get("held_out") and HeldOut.of_json(content["held_out"]),
         shared={
-            floor: FittedEffects(
-                tuple(SpeedAndLoad(**pace) for pace in paces),
-                **{name: arrays[f"shared/{floor}/{name}"] for name in _SHARED},
-            )
-            for floor, paces in content["shared"].items()
+            floor: _effects(arrays, floor, paces, n) for floor, paces in content["shared"].items()
         },
-        covariance=arrays["covariance"],
-        laplace=arrays["laplace"],
-        chain=Draws(arrays["chain"]) if "chain" in arrays else None,
+        covariance=_array(arrays, "covariance", n, n),
+        laplace=_array(arrays, "laplace", n, n),
+        chain=Draws(_array(arrays, "chain", None, None, n)) if "chain" in arrays else None,
         **{name: content[name] for name in _PLAIN},
     )
+
+
+def _near(settings: Content) -> list[tuple[str, list[float]]]:
+    """Return the search vectors, with their names, at which runs over several floors were cut."""
+    return [(f"settings.{k}.near", x["near"]) for k, x in settings.items() if k in _MIXED and x]
+
+
+def _array(arrays: Mapping[str, np.ndarray], name: str, *shape: int | None) -> np.ndarray:
+    """Return an array of numbers, of a shape in which None stands for any length.
+
+    Raises:
+        ValueError: the array is absent, not finite or of another shape.
+    """
+    found = arrays.get(name, np.array("nothing"))
+    if found.dtype != float or not np.isfinite(found).all():
+        raise ValueError(f"array {name}: expected finite numbers")
+    same = found.ndim == len(shape) and all(
+        b in (None, a) for a, b in zip(found.shape, shape, strict=True)
+    )
+    if not same:
+        raise ValueError(f"array {name} of shape {found.shape}; expected {shape}")
+    return found
+
+
+def _effects(
+    arrays: Mapping[str, np.ndarray], floor: str, paces: list[Content], n: int
+) -> FittedEffects:
+    """Return the shared effects on a floor of a fit with `n` free coordinates."""
+    of_floor = f"shared/{floor}"
+    q = _array(arrays, f"{of_floor}/coefs", 3, None).shape[1]
+    shapes = {"std": (3,), "coefs": (3, q), "by_number": (3, q, n), "covariance": (3, q, 3, q)}
+    parts = {name: _array(arrays, f"{of_floor}/{name}", *shape) for name, shape in shapes.items()}
+    return FittedEffects(tuple(SpeedAndLoad(**pace) for pace in paces), **parts)
+
+
+def _check(fit: Fit) -> None:
+    """Raise `ValueError` if parts of a fit contradict each other, or a value is not finite."""
+    if min(np.diag(fit.covariance).min(initial=0), np.diag(fit.laplace).min(initial=0)) < 0:
+        raise ValueError("negative variances; expected a covariance")
+    with np.errstate(over="ignore"):
+        for e in entries(fit.robot):
+            if not np.isfinite(np.asarray(e.get(fit.robot))).all():
+                raise ValueError(f"{e.path} = {e.get(fit.robot)}; expected finite numbers")
+    floors = {*fit.curves, *fit.validity, *fit.shared, *fit.selection}
+    floors |= {*fit.calibration.radius} if fit.calibration is not None else {*()}
+    if other := sorted(floors - {*fit.robot.surfaces.labels}):
+        raise ValueError(f"the floor '{other[0]}', which the robot does not know")
+    for floor, chosen in fit.selection.items():
+        if chosen.model not in chosen.errors or chosen.model not in {*fit.baselines, "contact"}:
+            raise ValueError(f"selection.{floor}: no errors or numbers of {chosen.model}")
 
 
 def _tuples(plain: Content) -> Content:
@@ -292,6 +343,9 @@ def _robot_of(kept: Content) -> Robot:
     )
     names = kept["surfaces"], kept["loads"], kept["sessions"]
     robot = build(geometry, *names, centre=tuple(kept["centre"]))
-    known = {e: kept["values"][e.path] for e in entries(robot)}
+    known = {e: kept["values"].get(e.path) for e in entries(robot)}
+    for e, value in known.items():
+        if value is None or np.size(value) != e.size:
+            raise ValueError(f"robot.values: {e.path}: {value}; expected {e.size} numbers")
     restored: Robot = with_values(robot, known)
     return restored

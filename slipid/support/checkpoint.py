@@ -79,6 +79,11 @@ def key_of(*parts: object) -> str:
     return mark.hexdigest()
 
 
+def _mark(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return the hash of arrays with their names, types and shapes."""
+    return key_of(*(part for name in sorted(arrays) for part in (name, arrays[name])))
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """Finished parts of one job, keyed by name, in files of one folder.
@@ -98,8 +103,8 @@ class Checkpoint:
     def save(self, name: str, arrays: Mapping[str, np.ndarray | float | int | str]) -> None:
         """Write arrays under a name to `<name>.npz`."""
         content = {k: np.asarray(v) for k, v in arrays.items()}
-        path = self.folder / f"{name}.npz"
-        write_arrays(path, content | {"key": np.asarray(self.key)}, compress=False)
+        marks = {"key": np.asarray(self.key), "sha256": np.asarray(_mark(content))}
+        write_arrays(self.folder / f"{name}.npz", content | marks, compress=False)
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
         """Return the arrays saved under a name, or None if this job has saved none."""
@@ -108,10 +113,16 @@ class Checkpoint:
             return None
         try:
             kept = read_arrays(path, "a checkpoint")
-        except DataError as error:
-            _LOG.warning("%s; it is computed again", error)
-            return None
-        return kept if str(kept.pop("key", None)) == self.key else None
+            key, written = (str(kept.pop(mark, None)) for mark in ("key", "sha256"))
+            if key != self.key:
+                return None
+            if written == _mark(kept):
+                return kept
+            error = DataError(f"{path}: its content does not match its checksum")
+        except DataError as found:
+            error = found
+        _LOG.warning("%s; it is computed again", error)
+        return None
 
     def save_json(self, name: str, content: object) -> None:
         """Write plain values under a name to `<name>.json`."""

@@ -1,6 +1,7 @@
 """Checking of TOML files against pydantic models; the error has a line for each mistake."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import UnionType
@@ -42,18 +43,24 @@ def mapping_of(path: Path, text: str) -> Content:
         raise DataError(f"{path}: {error}") from error
 
 
-def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
+def checked(
+    path: Path | str, mapping: object, model: type[Model], *, strict: bool = False
+) -> Model:
     """Return a mapping as an instance of a pydantic model or dataclass.
 
     Args:
         path: file, or name of the section, for messages.
         mapping: content of the file or section.
         model: type of the result.
+        strict: True for content of JSON, in which a number is not accepted as a string or vice
+            versa.
 
     Raises:
         DataError: the mapping does not match the model; every mistake is a line of the message.
     """
     try:
+        if strict:
+            return TypeAdapter(model).validate_json(json.dumps(mapping), strict=True)
         return TypeAdapter(model).validate_python(mapping)
     except ValidationError as error:
         lines = dict.fromkeys(_line(path, mapping, model, e) for e in error.errors())
@@ -66,7 +73,9 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
     steps = _steps(mapping, error["loc"], kind in ("missing", "missing_argument"))
     where = f"{path}: {spelled(steps)}" if steps else str(path)
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = list(_annotations(_kinds_at(mapping, root, steps[:-1])[0]))
+        known = [
+            name for one in _kinds_at(mapping, root, steps[:-1])[:1] for name in _annotations(one)
+        ]
         alike = did_you_mean(steps[-1], known)
         return f"{where}: no such key{alike}; expected one of {', '.join(known)}"
     if kind in ("missing", "missing_argument"):
@@ -129,7 +138,9 @@ def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[obje
 
 def _inner(kind: object, step: Step) -> list[object]:
     """Return the possible types of the value one step below a value of some type."""
-    if get_origin(kind) in (list, dict):
+    if get_origin(kind) in (list, tuple):
+        return _members(get_args(kind)[0])
+    if get_origin(kind) in (dict, Mapping):
         return _members(get_args(kind)[-1])
     return _members(_annotations(kind).get(str(step)))
 

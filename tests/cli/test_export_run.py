@@ -347,7 +347,7 @@ def test_logs_that_moved_are_2_and_the_option_is_named(small, tmp_path):
     assert (done.exit_code, "run003.csv: no such log" in done.stderr) == (2, True)
     (out / "run.json").write_text("{}")
     done = invoke("export-run", out, RUN, "--out", tmp_path / "run.mcap")
-    assert (done.exit_code, "run.json: no 'data'" in done.stderr) == (2, True)
+    assert (done.exit_code, "run.json: schema: missing" in done.stderr) == (2, True)
 
 
 def test_a_damaged_log_or_result_is_2_and_a_message(small, tmp_path):

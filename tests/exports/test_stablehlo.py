@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 
@@ -87,7 +88,7 @@ def test_a_lost_or_damaged_file_is_one_sentence(folder, name):
 def test_a_newer_file_is_refused(folder):
     about = json.loads((folder / "step.json").read_text())
     assert about["schema"] == SCHEMA
-    about["schema"] = "slipid.stablehlo/3"
+    about["schema"] = "slipid.stablehlo/4"
     (folder / "step.json").write_text(json.dumps(about))
     with pytest.raises(DataError, match="update slipid"):
         load_program(folder)
@@ -100,5 +101,10 @@ def test_a_program_that_says_other_numbers_is_refused(folder):
     buffer = io.BytesIO()
     np.savez(buffer, **kept)
     (folder / "golden.npz").write_bytes(buffer.getvalue())
+    with pytest.raises(DataError, match=r"golden\.npz: changed"):
+        load_program(folder)
+    about = json.loads((folder / "step.json").read_text())
+    about["sha256"]["golden.npz"] = hashlib.sha256(buffer.getvalue()).hexdigest()
+    (folder / "step.json").write_text(json.dumps(about))
     with pytest.raises(DataError, match="results of the program differ"):
         load_program(folder)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import hashlib
+import io
 import itertools
 import json
 from dataclasses import replace
@@ -42,7 +44,7 @@ from slipid.lab.selftest.logs import (
 from slipid.predict.validation import validation
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
-from slipid.support.files import hash_of
+from slipid.support.files import checksum, hash_of
 from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 from tests.helpers.killed_writes import Killed, dies_at
@@ -630,6 +632,92 @@ def test_damaged_results_are_refused_with_a_message(tmp_path):
         load(tmp_path)
     (tmp_path / "fit.json").write_text("{")
     with pytest.raises(DataError, match="not valid JSON"):
+        load(tmp_path)
+
+
+def sealed(folder, content):
+    """Write a content as fit.json with a checksum that fits, as somebody does who edits a file."""
+    content = {name: value for name, value in content.items() if name != "checksum"}
+    mark = checksum(content)
+    (folder / "fit.json").write_text(json.dumps(content | {"checksum": mark}))
+    (folder / "identified.json").write_text(json.dumps({"fit": mark}))
+
+
+NONSENSE = [
+    (("robot",), 3, "robot: 3; expected"),
+    (("robot",), None, "robot: None; expected"),
+    (("z",), ["1"], r"z\[1\]: '1'; expected"),
+    (("z",), [0.0], r"z: 1 numbers; expected \d+"),
+    (("z", 3), 1e300, "expected finite numbers"),
+    (("names",), ["a"], "its parameters differ"),
+    (("robot", "geometry", "place"), [[0, 0]], "lists of different lengths"),
+    (("robot", "geometry", "drive_of"), [5, 5, 5], "drives of the wheels"),
+    (("robot", "geometry", "gear_ratio"), -1, "gear_ratio: -1; expected"),
+    (("robot", "values", "motor.resistance"), [1, 2], "motor.resistance: .* expected 1 numbers"),
+    (("robot", "values", "motor.resistance"), -1.0, "motor.resistance"),
+    (("robot", "surfaces"), [], r"robot.surfaces: \[\]; expected"),
+    (("choices",), [{}], r"choices\[1\].pattern: missing"),
+    (("curves", "soft", "slip"), [1.0], "curves.soft: lists of different lengths"),
+    (("curves", "soft", "at"), {}, "no wheel_speed"),
+    (("curves", "hard"), "x", "curves.hard: 'x'; expected"),
+    (("validity", "soft", "loads"), 1, "validity.soft.loads: 1"),
+    (("validity", "soft", "more"), 1, "validity.soft.more: no such key"),
+    (("variances", "camera.place", "variance"), -1, "variance: -1; expected"),
+    (("settings", "windows_per_piece"), 0, "windows_per_piece: 0; expected"),
+    (("settings", "seed"), 1.5, "seed: 1.5; expected"),
+    (("settings", "mixed"), {"near": [1.0], "runs": 1, "windows": 1}, "mixed.near: 1 numbers"),
+    (("history",), 1, "history: 1; expected"),
+    (("current_trend",), [1], "current_trend"),
+    (("held_out",), {"rivals": 3}, "held_out"),
+    (("baselines",), {"linear": {"soft": [[1], 2]}}, "baselines.linear.soft: not an array"),
+    (("selection",), {"soft": {"model": "x"}}, "selection.soft.errors: missing"),
+    (("calibration",), {"surfaces": {}}, "calibration.centre_of_rotation_m: missing"),
+    (("data", "runs"), [["a"]], "data.runs"),
+    (("arrays", "file"), "../fit.npz", "arrays.file: .*pattern"),
+    (("extra",), 1, "extra: no such key"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), NONSENSE)
+def test_nonsense_with_a_right_checksum_is_refused_with_its_key(tmp_path, path, value, message):
+    save(fit_of(True), tmp_path)
+    content = json.loads((tmp_path / "fit.json").read_text())
+    place = content
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    sealed(tmp_path, content)
+    with pytest.raises(DataError, match=message) as caught:
+        load(tmp_path)
+    assert str(caught.value).startswith(str(tmp_path / "fit.json"))
+    assert "run `slipid identify` again" in str(caught.value)
+
+
+OTHER_ARRAYS = [
+    ("covariance", None, "array covariance: expected finite numbers"),
+    ("covariance", lambda x: x[:-1], r"array covariance of shape \(\d+, \d+\); expected"),
+    ("covariance", lambda x: -x, "negative variances"),
+    ("laplace", lambda x: x * np.nan, "array laplace: expected finite numbers"),
+    ("laplace", lambda x: x.astype(np.float32), "array laplace: expected finite numbers"),
+    ("shared/soft/coefs", lambda x: x[0], "array shared/soft/coefs of shape"),
+    ("shared/soft/std", lambda x: x[:2], "array shared/soft/std of shape"),
+    ("shared/soft/by_number", lambda x: x[..., 0], "array shared/soft/by_number of shape"),
+    ("chain", lambda x: np.zeros(3), r"array chain of shape \(3,\)"),
+]
+
+
+@pytest.mark.parametrize(("name", "change", "message"), OTHER_ARRAYS)
+def test_arrays_that_do_not_fit_are_refused(tmp_path, name, change, message):
+    *_, file = save(fit_of(True), tmp_path)
+    kept = dict(np.load(tmp_path / file))
+    old = kept.pop(name, None)
+    buffer = io.BytesIO()
+    np.savez(buffer, **(kept if change is None else {**kept, name: change(old)}))
+    (tmp_path / file).write_bytes(buffer.getvalue())
+    content = json.loads((tmp_path / "fit.json").read_text())
+    content["arrays"]["sha256"] = hashlib.sha256(buffer.getvalue()).hexdigest()
+    sealed(tmp_path, content)
+    with pytest.raises(DataError, match=message):
         load(tmp_path)
 
 

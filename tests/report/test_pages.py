@@ -222,7 +222,7 @@ def test_evidence_of_an_older_result_is_gathered_from_its_logs(small, fitted, tm
     ("change", "message"),
     [
         (lambda text: text.replace("slipid.evidence/1", "slipid.evidence/9"), "its schema is"),
-        (lambda text: text.replace('"runs":[', '"runs":[7,', 1), "runs.0"),
+        (lambda text: text.replace('"runs":[', '"runs":[7,', 1), r"runs\[1\]: 7"),
         (lambda text: text[:100], "evidence.json"),
         (lambda text: re.sub('"data_hash":"....', '"data_hash":"0000', text), "of other logs"),
     ],

@@ -3,15 +3,19 @@
 import json
 import os
 
+import numpy as np
 import pytest
 
+from slipid.app.logs import log_folder
 from slipid.app.reference_robots import reference_robot
 from slipid.exports.feedforward import gains_json
 from slipid.infer.verdicts.disputed import LoadComparison
 from slipid.model.feedforward import Feedforward, Gain
+from slipid.report.html import results
 from slipid.report.html.blocks import CopyLines, FigureBlock, TableBlock, TextBlock
 from slipid.report.html.evidence import FitEvidence, Quarters, write_evidence
 from slipid.report.html.fit_page import fit_page
+from slipid.report.html.later_content import COMMANDS, LATER
 from slipid.report.html.results import read_results
 from slipid.report.html.sections.predictions import _played
 from slipid.support.errors import DataError
@@ -38,7 +42,12 @@ CALIBRATION = {
     "multipliers": {"wood": {"wheel_radius": [0.994, 1.008], "track": 1.04}},
     "nominal": {"wheel_radius_m": 0.05, "track_m": 0.3},
     "firmest": "wood",
-    "noise": {"place": 0.001, "heading": 0.003, "process": {}, "effect": {}},
+    "noise": {
+        "place": 0.001,
+        "heading": 0.003,
+        "process": {"wood": [0.0] * 3},
+        "effect": {"wood": [0.0] * 3},
+    },
     "runs": 6,
     "settled": True,
 }
@@ -46,7 +55,7 @@ CALIBRATION = {
 
 def parameter(x, interval, verdict, ratio, unit="1"):
     shared = {"unit": unit, "shape": [], "labels": [], "std": 0.1, "source": "laplace"}
-    prior = {"doc": "", "ratio": ratio, "prior_mean": 0.4, "prior_std": 0.2}
+    prior = {"doc": "", "ratio": ratio, "pull": 0.0, "prior_mean": 0.4, "prior_std": 0.2}
     own = {"value": x, "interval90": interval, "verdict": verdict, "provenance": "measured"}
     return shared | prior | own
 
@@ -74,6 +83,7 @@ def folder(tmp_path):
         "derived": {},
         "surfaces": ["wood"],
         "curves": {},
+        "validity": {},
         "messages": [],
         "calibration": CALIBRATION,
         "selected_model": {"wood": "calibrated"},
@@ -81,6 +91,7 @@ def folder(tmp_path):
         "data": {"hash": "ab" * 32, "runs": ["wood/0.csv"]},
     }
     run = {
+        "schema": "slipid.run/1",
         "finished": "2026-01-01T00:00:00+00:00",
         "seconds": 9.0,
         "config": {"name": "robot.toml", "sha256": "cd" * 32},
@@ -95,6 +106,7 @@ def folder(tmp_path):
     behind = {"nominal": [0.046, 0.01], "calibrated": [0.0, 0.0], "contact": [0.016, 0.02]}
     fit = {
         "parameters": parameters,
+        "settings": {},
         "flat": [flat],
         "selection": {"wood": {"behind": behind}},
         "converged": True,
@@ -114,6 +126,112 @@ def page_of(folder):
 
 def words(blocks):
     return " ".join(" ".join(b.sentences) for b in blocks if isinstance(b, TextBlock))
+
+
+def changed(folder, name, path, value):
+    """Replace a value of a JSON file by another one, or remove it if the value is `...`."""
+    file = folder / f"{name}.json"
+    content = json.loads(file.read_text())
+    place = content
+    for key in path[:-1]:
+        place = place[key]
+    if value is ...:
+        del place[path[-1]]
+    else:
+        place[path[-1]] = value
+    file.write_text(json.dumps(content))
+
+
+DAMAGED = [
+    ("identified", ("schema",), "x/1", "schema: 'x/1'; expected"),
+    ("identified", ("parameters",), ..., "parameters: missing"),
+    ("identified", ("parameters", "camera.lag", "value"), "x", "value: 'x'; expected"),
+    ("identified", ("parameters", "camera.lag", "interval90"), [1.0], "interval90"),
+    ("identified", ("parameters", "camera.lag", "labels"), ["a", "b"], "with 2 labels"),
+    ("identified", ("parameters", "camera.lag", "verdict"), "sure", "verdict: 'sure'; expected"),
+    ("identified", ("curves",), {"wood": {}}, "curves.wood.torque_nm: missing"),
+    ("identified", ("data",), [], r"data: \[\]; expected"),
+    ("identified", ("trust", "reasons"), 3, "trust.reasons: 3; expected"),
+    ("identified", ("calibration", "surfaces", "wood"), {}, "rolling_radius_m: missing"),
+    ("identified", ("calibration", "nominal", "track_m"), ..., "other floors or lengths"),
+    ("identified", ("calibration", "firmest"), "ice", "other floors or lengths"),
+    ("identified", ("calibration", "pose_lag_s"), 7, "pose_lag_s: 7; expected"),
+    ("run", ("config",), ..., "config: missing"),
+    ("run", ("data", "folder"), 3.0, "data.folder: 3.0; expected"),
+    ("run", ("versions",), [], "versions"),
+    ("fit", ("parameters", "camera.lag", "prior_std"), "x", "prior_std"),
+    ("fit", ("flat",), [{}], r"flat\[1\].paths: missing"),
+]
+
+
+@pytest.mark.parametrize(("name", "path", "value", "message"), DAMAGED)
+def test_a_damaged_result_is_refused_with_its_key(folder, name, path, value, message):
+    changed(folder, name, path, value)
+    with pytest.raises(DataError, match=message) as caught:
+        read_results(folder)
+    assert str(caught.value).startswith(str(folder / f"{name}.json: "))
+    assert str(caught.value).endswith("; run `slipid identify` again")
+
+
+@pytest.mark.parametrize("name", LATER)
+@pytest.mark.parametrize("content", [{}, {"runs": 3}, {"summary": {}, "questions": {"a": 1}}])
+def test_a_damaged_result_of_another_command_is_refused(folder, name, content):
+    (folder / f"{name}.json").write_text(json.dumps(content))
+    command = COMMANDS.get(name, name)
+    with pytest.raises(DataError, match=rf"{name}\.json: .*; run `slipid {command}` again$"):
+        read_results(folder)
+
+
+@pytest.mark.parametrize("value", [{}, {"data": {}}, {"data": {"folder": 5.5}}, [], "x"])
+def test_logs_are_not_sought_by_a_damaged_run_file(folder, value):
+    (folder / "run.json").write_text(json.dumps(value))
+    with pytest.raises(DataError, match=r"run\.json: .*; run `slipid identify` again"):
+        log_folder(folder, None)
+    (folder / "run.json").write_text("[" * 10_000)
+    with pytest.raises(DataError, match=r"run\.json: not valid JSON"):
+        log_folder(folder, None)
+    assert log_folder(folder, folder) == folder
+
+
+def posterior_file(path, lag):
+    h5py = pytest.importorskip("h5py", reason="draws need the extra posterior")
+    with h5py.File(path, "w") as file:
+        group = file.create_group("posterior")
+        group["surface"] = np.array([b"wood"])
+        group["camera.lag"] = lag
+        group["surface.friction"] = np.ones((2, 5, 1))
+
+
+DRAWS = np.linspace(0.0, 1.0, 10).reshape(2, 5)
+HOSTILE_DRAWS = [
+    np.full((2, 5), np.nan),
+    np.ones((2, 6)),
+    np.zeros((0, 5)),
+]
+
+
+@pytest.mark.parametrize("lag", HOSTILE_DRAWS)
+def test_draws_that_are_none_are_refused(folder, lag):
+    posterior_file(folder / "posterior.nc", DRAWS)
+    found = read_results(folder).draws
+    np.testing.assert_array_equal(found["camera.lag"], DRAWS.ravel())
+    assert found["surface.wood.friction"].shape == (10,)
+    posterior_file(folder / "posterior.nc", lag)
+    with pytest.raises(DataError, match=r"posterior\.nc: .* draws of parameters, or not finite"):
+        read_results(folder)
+
+
+def test_a_damaged_file_of_draws_is_refused(folder, monkeypatch):
+    path = folder / "posterior.nc"
+    posterior_file(path, DRAWS)
+    whole = path.read_bytes()
+    monkeypatch.setattr(results, "MOST_NUMBERS", 20)
+    with pytest.raises(DataError, match=r"posterior\.nc: over 20 numbers"):
+        read_results(folder)
+    for damaged in (whole[:300], b"x" * 900, whole.replace(b"surface\0", b"surfacf\0")):
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=r"posterior\.nc: cannot be read .* run it again"):
+            read_results(folder)
 
 
 def test_the_verdict_stands_first_with_its_reasons_and_at_most_five_notes(folder):
@@ -240,7 +358,10 @@ def test_the_table_of_what_was_driven_is_that_of_two_wheels(folder):
 def test_the_loads_stand_beside_the_differences_that_would_have_been_seen(folder):
     write_evidence(driven((0.1, 0.2), 0.0), folder)
     ends = [[0.45, 0.55], [0.45, 0.55]]
-    shares = parameter([0.5, 0.5], ends, "identified", 0.1) | {"labels": ["wheel 1", "wheel 2"]}
+    shares = parameter([0.5, 0.5], ends, "identified", 0.1) | {
+        "labels": ["wheel 1", "wheel 2"],
+        "std": [0.1] * 2,
+    }
     one = LoadComparison(("wood", "rug"), 3.1, (0.06, 0.11)).to_json()
     other = LoadComparison(("wood", "tiles"), 0.2, (0.4, 0.3)).to_json()
     for name, more in (("identified", {}), ("fit", {"load_comparisons": [one, other]})):

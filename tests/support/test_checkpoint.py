@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
+from slipid.support.files import read_arrays, write_arrays
 
 ARRAYS = {"z": np.arange(3.0), "stage": "joint", "round": 4}
 PLAIN = {"x": np.pi, "rows": [1.0 / 3.0, None, "a"]}
@@ -72,6 +73,17 @@ def test_an_edited_number_is_noticed(kept, caplog):
     path.write_text(path.read_text().replace("3.14", "3.24"))
     assert kept.load_json("part") is None
     assert "does not match its checksum" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "other", [{"z": np.arange(4.0)}, {"z": np.arange(3)}, {"y": np.arange(3.0)}]
+)
+def test_arrays_that_were_exchanged_are_noticed(kept, other, caplog):
+    arrays = read_arrays(kept.folder / "part.npz", "a checkpoint")
+    rest = {name: array for name, array in arrays.items() if name != "z"}
+    write_arrays(kept.folder / "part.npz", rest | other)
+    assert kept.load("part") is None
+    assert "does not match its checksum; it is computed again" in caplog.text
 
 
 def test_absent_and_other_parts_are_not_logged(kept, caplog):

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from slipid.app.calibrate import read_calibration
 from slipid.app.config import Config, LogsSection, read_config, shape_of
 from slipid.app.floor_maps import map_path
-from slipid.app.logs import matching_files, read_dataset
+from slipid.app.logs import matching_files, read_dataset, read_run_file
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
@@ -39,7 +39,6 @@ from slipid.predict import open_loop as replay
 from slipid.predict.selection import aligned_path
 from slipid.robot.estimator import Estimator
 from slipid.support.errors import DataError, first_names
-from slipid.support.files import read_json
 from slipid.support.progress import Reporter
 
 _EXPECTED = "a result of `slipid identify`"
@@ -88,12 +87,9 @@ def run_view(
     Raises:
         DataError: there is no result, no such run, or the log cannot be read or predicted.
     """
-    about = read_json(out / "run.json", _EXPECTED)
-    try:
-        fitted, folder = dict(about["data"]["logs"]), Path(about["data"]["folder"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{out / 'run.json'}: no {error}; expected {_EXPECTED}") from error
-    config, root = read_config(out / "config.toml"), folder if data is None else data
+    about = read_run_file(out).data
+    fitted = about.logs
+    config, root = read_config(out / "config.toml"), Path(about.folder) if data is None else data
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
     name = _name_of(wanted, list(fitted), root, out)

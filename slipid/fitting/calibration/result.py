@@ -270,7 +270,7 @@ class Calibration:
 
         floors, noise = content["surfaces"], content["noise"]
         steering = content.get("steering", {})
-        length = "base_m" if "base_m" in content["nominal"] else "track_m"
+        length = "track_m" if content["nominal"].get("base_m") is None else "base_m"
         x, y = content["pose_offset_m"]
         return cls(
             sideways=length == "base_m" and not steering,
@@ -284,7 +284,7 @@ class Calibration:
             scale=value(content["pose_scale"]),
             firmest=content["firmest"],
             steering={name: value(v) for name, v in steering.items()},
-            gyro={name: value(content[name]) for name in GYRO_PRIORS if name in content},
+            gyro={n: value(content[n]) for n in GYRO_PRIORS if content.get(n) is not None},
             nominal_radius=content["nominal"]["wheel_radius_m"],
             nominal_base=content["nominal"][length],
             noise=MotionNoise(

@@ -7,11 +7,12 @@ show: millimetres, milliradians and hundredths.
 from collections.abc import Mapping
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
+from slipid.infer.result_content import checked_result
 from slipid.infer.result_folder import fit_of
 from slipid.support.errors import DataError
-from slipid.support.files import write_bytes
+from slipid.support.files import read_json, write_bytes
 
 EVIDENCE, SCHEMA = "evidence.json", "slipid.evidence/1"
 
@@ -237,15 +238,8 @@ def read_evidence(path: Path) -> FitEvidence:
     Raises:
         DataError: the file cannot be read, or is not evidence of this version.
     """
-    expected = "expected the evidence that `slipid identify` writes"
-    try:
-        found = FitEvidence.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; {expected}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        raise DataError(f"{path}: {where}: {first['msg']}; {expected}") from error
+    expected = "the evidence that `slipid identify` writes"
+    found = checked_result(path, read_json(path, expected), FitEvidence)
     if found.schema_ != SCHEMA:
         raise DataError(f"{path}: its schema is {found.schema_}; expected {SCHEMA}")
     return found

@@ -6,19 +6,23 @@ from typing import Any
 
 import numpy as np
 
+from slipid.infer.result_content import AGAIN, IdentifiedContent, RunContent, checked_result
 from slipid.infer.result_folder import FIT, IDENTIFIED, fit_of, refuse_other_fit
 from slipid.report.html.evidence import EVIDENCE, FitEvidence, read_evidence
+from slipid.report.html.later_content import COMMANDS, LATER, ShownFitContent
 from slipid.support.content import Content
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, bad_data, refused_as
 from slipid.support.files import read_json
 from slipid.support.toml_file import mapping_of, text_of
 
 RESULT = "a result of `slipid identify`"
 DRAWS = "posterior.nc"
-LATER = ("validation", "comparison", "trial", "design", "sample")
-"""Names of the commands whose results a page shows, and of their files without .json."""
 MOST_DRAWS = 1500
 """Largest number of draws of a posterior that are shown."""
+MOST_NUMBERS = 2**26
+"""Largest number of values in posterior.nc."""
+PARTS = ("motor", "camera", "robot", "surface")
+"""Parts of a robot whose parameters are shown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +103,9 @@ def read_results(out: Path) -> Results:
             belongs to another fit.
     """
     fit = fit_of(out)
-    identified = _content(out / IDENTIFIED, RESULT)
-    run = _content(out / "run.json", RESULT)
-    for key in ("parameters", "surfaces", "data", "messages"):
-        if key not in identified:
-            raise DataError(f"{out / IDENTIFIED}: no '{key}'; expected {RESULT}")
+    identified, run = _content(out / IDENTIFIED, RESULT), _content(out / "run.json", RESULT)
+    checked_result(out / IDENTIFIED, identified, IdentifiedContent)
+    checked_result(out / "run.json", run, RunContent)
     evidence = read_evidence(out / EVIDENCE) if (out / EVIDENCE).exists() else None
     if evidence is not None:
         refuse_other_fit(out, out / EVIDENCE, evidence.fit)
@@ -118,9 +120,9 @@ def read_results(out: Path) -> Results:
         drive=_drive(out / "config.toml"),
         identified=identified,
         run=run,
-        fit=_maybe(out / FIT),
+        fit=_maybe(out / FIT, ShownFitContent, AGAIN),
         evidence=evidence,
-        **{n: None if n in outdated else _maybe(out / f"{n}.json") for n in LATER},
+        **{n: None if n in outdated else _later(out, n) for n in LATER},
         draws=_draws(out) if (out / DRAWS).exists() and "sample" not in outdated else None,
         exports=tuple(sorted(p.parent.name for p in out.glob("*/SHA256SUMS"))),
         has_robot=(out / "robot.json").exists(),
@@ -148,7 +150,8 @@ def _outdated(out: Path, fit: str | None, data_hash: object) -> tuple[str, ...]:
     """
 
     def is_of_fit(name: str) -> bool:
-        found = _maybe(out / f"{name}.json") or {}
+        path = out / f"{name}.json"
+        found = _content(path, "the result of a command of slipid") if path.exists() else {}
         if name != "comparison":
             return found.get("fit") in (None, fit)
         of = found.get("data")  # a comparison is made from logs, without the fit
@@ -157,9 +160,19 @@ def _outdated(out: Path, fit: str | None, data_hash: object) -> tuple[str, ...]:
     return tuple(name for name in LATER if not is_of_fit(name))
 
 
-def _maybe(path: Path) -> Content | None:
-    """Return the content of a JSON file, or None if it is absent."""
-    return _content(path, "the result of a command of slipid") if path.exists() else None
+def _later(out: Path, name: str) -> Content | None:
+    """Return the content of the file of a later command, or None if it is absent."""
+    again = f"run `slipid {COMMANDS.get(name, name)}` again"
+    return _maybe(out / f"{name}.json", LATER[name], again)
+
+
+def _maybe(path: Path, kind: type, again: str) -> Content | None:
+    """Return the content of a JSON file, or None if it is absent; `again` is a remedy."""
+    if not path.exists():
+        return None
+    content = _content(path, "the result of a command of slipid")
+    checked_result(path, content, kind, again)
+    return content
 
 
 def _draws(out: Path) -> dict[str, np.ndarray] | None:
@@ -172,20 +185,28 @@ def _draws(out: Path) -> dict[str, np.ndarray] | None:
         import h5py
     except ImportError:
         return None
-    path, found = out / DRAWS, dict[str, np.ndarray]()
-    try:
-        with h5py.File(path) as file:
-            refuse_other_fit(out, path, file.attrs.get("fit"))
-            group: Any = file["posterior"]
-            floors = [name.decode() for name in group["surface"][:]]
-            for name, values in group.items():
-                part, _, rest = name.partition(".")
-                if values.ndim == 2 and part in ("motor", "camera", "robot"):
-                    found[name] = np.asarray(values, float).ravel()
-                elif values.ndim == 3 and part == "surface" and values.shape[2] == len(floors):
-                    for k, floor in enumerate(floors):
-                        found[f"surface.{floor}.{rest}"] = np.asarray(values[:, :, k]).ravel()
-    except (OSError, KeyError, AttributeError) as error:
-        raise DataError(f"{path}: {error}; expected draws of `slipid sample`") from error
-    step = max(1, *(len(x) // MOST_DRAWS for x in found.values())) if found else 1
+    expected, path = "draws that `slipid sample` wrote; run it again", out / DRAWS
+    arrays: dict[str, np.ndarray] = {}
+    with refused_as(path, expected), h5py.File(path) as file:
+        mark = file.attrs.get("fit")
+        group: Any = file["posterior"]
+        if sum(one.size for one in group.values()) > MOST_NUMBERS:
+            raise bad_data(path, f"over {MOST_NUMBERS} numbers", expected)
+        floors = [name.decode() for name in group["surface"][:].tolist()]
+        for name, one in group.items():
+            if one.dtype == float and name.partition(".")[0] in PARTS:
+                arrays[name] = one[:]
+    refuse_other_fit(out, path, None if mark is None else str(mark))
+    found: dict[str, np.ndarray] = {}
+    for name, values in arrays.items():
+        part, _, rest = name.partition(".")
+        if values.ndim == 2 and part != "surface":
+            found[name] = values.ravel()
+        elif values.ndim == 3 and part == "surface" and values.shape[2] == len(floors):
+            for k, floor in enumerate(floors):
+                found[f"surface.{floor}.{rest}"] = values[:, :, k].ravel()
+    sizes = {len(x) for x in found.values()}
+    if len(sizes) != 1 or 0 in sizes or not all(np.isfinite(x).all() for x in found.values()):
+        raise bad_data(path, f"{sorted(sizes)} draws of parameters, or not finite ones", expected)
+    step = max(1, sizes.pop() // MOST_DRAWS)
     return {name: x[::step] for name, x in found.items()}
