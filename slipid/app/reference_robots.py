@@ -174,7 +174,7 @@ def read_reference(path: Path) -> ReferenceRobot:
         DataError: the file is missing or damaged; every mistake is a line of the message.
     """
     content = read_json(path, f"a reference robot ({SCHEMA})")
-    return checked(path, content, ReferenceRobot)
+    return checked(path, content, ReferenceRobot, strict=True)
 
 
 @cache

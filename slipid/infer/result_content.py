@@ -100,7 +100,8 @@ class CalibrationContent:
         track = self.nominal.base_m is None
         for floor, one in self.surfaces.items():
             length = one.effective_track_m if track else one.effective_base_m
-            if length is None or min(length.value, *(r.value for r in one.rolling_radius_m)) <= 0:
+            radii = [r.value for r in one.rolling_radius_m]
+            if length is None or not radii or min(length.value, *radii) <= 0:
                 raise ValueError(f"{floor}: no positive radii, and track or base as in `nominal`")
         floors = {*self.noise.process, *self.noise.effect, *self.multipliers, self.firmest}
         if track == (self.nominal.track_m is None) or floors != {*self.surfaces}:
@@ -112,7 +113,7 @@ class CalibrationContent:
 
 @dataclass(frozen=True, config=OPEN)
 class NumberContent:
-    """A number of identified.json."""
+    """A number of identified.json; only fit.json has its meaning and its prior."""
 
     value: Numbers
     unit: str
@@ -122,6 +123,11 @@ class NumberContent:
     verdict: Literal["identified", "weak", "disputed", "not_identified", "at_bound", "fixed"]
     provenance: Literal["measured", "borrowed", "override"]
     source: str
+    doc: str = ""
+    ratio: float | None = None
+    pull: float | None = None
+    prior_mean: Numbers | None = None
+    prior_std: Numbers | None = None
 
     def __post_init__(self) -> None:
         """Raise `ValueError` unless all parts have the number of labels."""
@@ -131,17 +137,6 @@ class NumberContent:
             part = getattr(self, name)
             if part is not None and np.shape(part) != ((size, *shape) if size else shape):
                 raise ValueError(f"{name} of shape {np.shape(part)} with {size} labels")
-
-
-@dataclass(frozen=True, config=OPEN)
-class EstimateContent(NumberContent):
-    """A number of fit.json, with its prior."""
-
-    doc: str
-    ratio: float | None
-    pull: float | None
-    prior_mean: Numbers | None
-    prior_std: Numbers | None
 
 
 @dataclass(frozen=True, config=OPEN)
@@ -173,6 +168,9 @@ class TrustContent:
     held_out_error_over_path: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
+NO_TRUST = TrustContent("doubtful", [])
+
+
 @dataclass(frozen=True, config=OPEN)
 class ErrorsContent:
     """Errors of predicted readings."""
@@ -186,6 +184,60 @@ class HeldOutContent(ErrorsContent):
     """Errors of predicted readings of the fit and of its rivals."""
 
     rivals: dict[str, ErrorsContent]
+
+
+@dataclass(frozen=True, config=OPEN)
+class GainContent:
+    """A feed-forward gain."""
+
+    value: float
+    unit: str
+    verdict: str
+    interval90: Pair | None
+
+
+NO_GAIN = GainContent(0.0, "", "", None)
+
+
+@dataclass(frozen=True, config=OPEN)
+class FeedforwardContent:
+    """Feed-forward gains of a motor or axis; those that are absent stand for none."""
+
+    kS: GainContent = NO_GAIN
+    kV: GainContent = NO_GAIN
+    kA: GainContent = NO_GAIN
+    kG: GainContent = NO_GAIN
+    per_rotation: dict[str, GainContent] = field(default_factory=dict)
+    per_metre: dict[str, GainContent] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, config=OPEN)
+class FeedbackGainContent:
+    """A feedback gain."""
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True, config=OPEN)
+class DemandContent:
+    """Demand for which feedback gains are designed."""
+
+    position_error: float
+    effort: float
+    period_s: float
+    delay_s: float
+
+
+@dataclass(frozen=True, config=CLOSED)
+class FeedbackContent:
+    """Feedback gains of a motor or axis."""
+
+    velocity_kP: FeedbackGainContent
+    position_kP: FeedbackGainContent
+    position_kD: FeedbackGainContent
+    verdict: str
+    demand: DemandContent
 
 
 @dataclass(frozen=True, config=OPEN)
@@ -212,8 +264,19 @@ class IdentifiedContent:
     held_out: HeldOutContent | None = None
     calibration: CalibrationContent | None = None
     selected_model: dict[str, str] = field(default_factory=dict)
-    trust: TrustContent | None = None
+    trust: TrustContent = NO_TRUST
+    feedforward: dict[str, FeedforwardContent] = field(default_factory=dict)
+    feedback: dict[str, FeedbackContent] = field(default_factory=dict)
     fit: str = ""
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` if floors have errors, but no selected model or number of runs."""
+        found = self.trust.held_out_error_over_path
+        for floor in found:
+            if floor not in self.selected_model or floor not in self.trust.runs:
+                raise ValueError(f"'{floor}' has errors, but no selected model or number of runs")
+            if self.selected_model[floor] not in found[floor]:
+                raise ValueError(f"the model selected on '{floor}' has no errors")
 
 
 @dataclass(frozen=True, config=OPEN)
@@ -354,8 +417,8 @@ class FitContent:
     rounds: Count
     remaining: float
     history: list[float | None]
-    parameters: dict[str, EstimateContent]
-    derived: dict[str, EstimateContent]
+    parameters: dict[str, NumberContent]
+    derived: dict[str, NumberContent]
     flat: list[Content]
     load_comparisons: list[LoadComparison]
     messages: list[str]

@@ -6,10 +6,11 @@ show: millimetres, milliradians and hundredths.
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
 
-from slipid.infer.result_content import checked_result
+from slipid.infer.result_content import Count, checked_result
 from slipid.infer.result_folder import fit_of
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_bytes
@@ -23,7 +24,19 @@ class _Record(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Track(_Record):
+class _Columns(_Record):
+    """A part whose lists have one length."""
+
+    @model_validator(mode="after")
+    def _of_one_length(self) -> Self:
+        """Raise `ValueError` for lists of other lengths."""
+        lengths = {name: len(x) for name, x in self if isinstance(x, list)}
+        if len({*lengths.values()}) > 1:
+            raise ValueError(f"lists of different lengths: {lengths}")
+        return self
+
+
+class Track(_Columns):
     """Poses of the body along a run, in the frame of the logged poses, corrected by the camera.
 
     Attributes:
@@ -36,7 +49,7 @@ class Track(_Record):
     yaw_mrad: list[int]
 
 
-class PointRegions(_Record):
+class PointRegions(_Columns):
     """The 90 % regions of some predicted points of a run, which are ellipses.
 
     Attributes:
@@ -45,7 +58,7 @@ class PointRegions(_Record):
         angle_mrad: direction of the major axis [mrad].
     """
 
-    edge: list[int]
+    edge: list[Count]
     major_mm: list[float]
     minor_mm: list[float]
     angle_mrad: list[int]
@@ -64,7 +77,7 @@ class MapEvidence(_Record):
     surfaces: list[str]
     corner_m: tuple[float, float]
     cell_m: tuple[float, float]
-    cells: list[list[int]]
+    cells: list[list[Count]]
 
 
 class RunEvidence(_Record):
@@ -89,7 +102,7 @@ class RunEvidence(_Record):
     name: str
     floor: str
     load: str
-    map: int | None = None
+    map: Count | None = None
     heading_deg: float | None
     speed: float | None
     seconds: float
@@ -102,7 +115,7 @@ class RunEvidence(_Record):
     selected: str
 
 
-class Quarters(_Record):
+class Quarters(_Columns):
     """Quarters of runs: how they were driven, and errors of the selected model, as columns.
 
     Attributes:
@@ -117,7 +130,7 @@ class Quarters(_Record):
         yaw_deg_s: predicted less measured yaw rate [deg/s].
     """
 
-    run: list[int]
+    run: list[Count]
     time_s: list[float]
     seconds: list[float]
     speed: list[float]
@@ -128,7 +141,7 @@ class Quarters(_Record):
     yaw_deg_s: list[float]
 
 
-class WheelDots(_Record):
+class WheelDots(_Columns):
     """Measured slip and torque of the wheels in segments of the runs, as columns.
 
     Attributes:
@@ -138,13 +151,13 @@ class WheelDots(_Record):
         slip: slip of the wheel [1].
     """
 
-    run: list[int]
-    drive: list[int]
+    run: list[Count]
+    drive: list[Count]
     torque_nm: list[float]
     slip: list[float]
 
 
-class CurrentDots(_Record):
+class CurrentDots(_Columns):
     """Measured and predicted motor currents in segments of the runs, as columns [A].
 
     Attributes:
@@ -155,8 +168,8 @@ class CurrentDots(_Record):
         fitted: currents predicted by the fit.
     """
 
-    run: list[int]
-    drive: list[int]
+    run: list[Count]
+    drive: list[Count]
     measured: list[float]
     start: list[float]
     fitted: list[float]
@@ -175,7 +188,7 @@ class WheelLayout(_Record):
 
     place_m: list[tuple[float, float]]
     angle_deg: list[float]
-    drive: list[int]
+    drive: list[Count]
     radius_m: float
     sideways: bool
 
@@ -222,6 +235,27 @@ class FitEvidence(_Record):
     currents: CurrentDots | None = None
     correlations: Correlations | None = None
     notes: list[str] = []
+
+    @model_validator(mode="after")
+    def _of_known_runs(self) -> Self:
+        """Raise `ValueError` for an index of a run, map, surface or pose that is absent."""
+        if max(self.quarters.run, default=-1) >= len(self.runs):
+            raise ValueError(f"quarters of more than {len(self.runs)} runs")
+        for one in (*self.runs, *self.over_floors):
+            lengths = {
+                len(one.time_s),
+                *(len(t.x_mm) for t in (one.measured, *one.models.values())),
+            }
+            edges = max(one.region.edge, default=-1) if one.region is not None else -1
+            if len(lengths) > 1 or edges >= len(one.time_s):
+                raise ValueError(f"{one.name}: paths of {sorted(lengths)} poses")
+            if one.map is not None and one.map >= len(self.maps):
+                raise ValueError(f"{one.name}: map {one.map + 1} of {len(self.maps)}")
+        for here in self.maps:
+            most = max((k for row in here.cells for k in row), default=-1)
+            if most >= len(here.surfaces) or len({len(row) for row in here.cells}) > 1:
+                raise ValueError("a map with unknown surfaces, or rows of different lengths")
+        return self
 
 
 def write_evidence(found: FitEvidence, out: Path) -> Path:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from slipid.infer.result_content import OPEN, Count, EstimateContent, Pair
+from slipid.infer.result_content import OPEN, Count, NumberContent, Pair
 from slipid.infer.verdicts.disputed import LoadComparison
 
 Text = Annotated[str, Field(min_length=1)]
@@ -34,7 +34,7 @@ class ShownFitContent:
 
     converged: bool
     reason: str
-    parameters: dict[str, EstimateContent]
+    parameters: dict[str, NumberContent]
     flat: list[FlatContent]
     settings: dict[str, Any]
     selection: dict[str, BehindContent] = field(default_factory=dict)
