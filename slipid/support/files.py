@@ -80,8 +80,9 @@ def target_of(path: Path) -> Path:
             kind = "a device or a pipe"
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except OSError as error:
-        raise DataError(f"{str(path)[:80]}: cannot be written ({error.strerror})") from error
+    except (OSError, ValueError) as error:  # a null character in a path is a ValueError
+        reason = getattr(error, "strerror", None) or str(error)
+        raise DataError(f"{str(path)[:80]}: cannot be written ({reason})") from error
     # /dev/stdout leads to a file if the output is redirected; replacing this would lose the output
     _, *above = path.absolute().parts[:3]
     if above[:1] in (["dev"], ["proc"]) and above != ["dev", "shm"]:

@@ -30,7 +30,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", "-l", folder], check=True)
 
 
-@pytest.mark.parametrize("path", [Path(""), Path("."), Path("/")])
+@pytest.mark.parametrize("path", [Path(""), Path("."), Path("/"), Path("a\0b")])
 def test_what_is_no_file_cannot_be_written(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DataError, match="cannot be written"):
