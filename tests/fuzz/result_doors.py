@@ -191,7 +191,7 @@ def _program(path: Path) -> None:
     load_program(path.parent)  # its state may hold nan, for what was not measured yet
 
 
-DOORS = (
+FITS = (
     Door("fit", _results(), _fit, ("fit.json", "identified.json"), weight=0.2),
     Door("fit_sealed", _results(), _fit, ("fit.json",), _sealed_fit, 0.5),
     Door("fit_arrays", _results(), _fit, ("fit*.npz",), _sealed_fit, 0.3),
@@ -214,6 +214,10 @@ DOORS = (
     ),
     Door("run_file", _results("run.json"), lambda _: log_folder(HERE, None)),
     Door("calibration", _results("identified.json"), lambda _: read_calibration(HERE)),
+)
+"""Doors whose specimens are results of a fit."""
+DOORS = (
+    *FITS,
     Door("checkpoint_arrays", _checkpoint, _arrays, ("a.npz",)),
     Door("checkpoint_values", _checkpoint, _plain, ("a.json",)),
     Door("floor_arrays", _floor, _loaded_floor),

@@ -15,8 +15,6 @@ from tests.fuzz.traps import ENDLESS, TRAPS
 
 COUNT = 6000
 """Cases over all doors."""
-NOT_YET = frozenset({"packaged_logs", "fit_sealed", "fit_arrays", "run_file", "page"})
-"""Doors that do not pass yet; `make fuzz` tries them, too."""
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +34,13 @@ def tried(door: Door, keeper: Doorkeeper, count: int, folder: Path) -> Tally:
 
 def of_door(door: Door):
     """A door as a parameter of a test."""
-    made = door in result_doors.DOORS
-    return pytest.param(door, id=door.name, marks=[pytest.mark.slow] if made else [])
+    slow = door in result_doors.FITS or door.name.startswith("exported")
+    return pytest.param(door, id=door.name, marks=[pytest.mark.slow] if slow else [])
 
 
-@pytest.mark.parametrize("door", [of_door(door) for door in DOORS if door.name not in NOT_YET])
+@pytest.mark.parametrize("door", [of_door(door) for door in DOORS])
 def test_damaged_files_are_refused_in_one_sentence_or_read_right(door, keeper, tmp_path, request):
-    if door in result_doors.DOORS:
+    if door in result_doors.FITS:
         keeper.out = request.getfixturevalue("sampled")[0]
     count = max(2, shares(DOORS, COUNT)[door.name])
     tally = tried(door, keeper, count, tmp_path)
