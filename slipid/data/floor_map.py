@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field
 
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, refused_as
 from slipid.support.extras import require
 from slipid.support.files import write_bytes
 from slipid.support.quantities import CellLength, Coordinate, InsidePath, Label
@@ -280,21 +280,25 @@ def _pictured(path: Path, given: PicturedFile) -> FloorMap:
     _require_matplotlib()
     from matplotlib.colors import to_rgb
     from matplotlib.image import imread
+    from PIL import Image
 
     source = _beside(path, given.picture)
-    try:
+    with refused_as(f"{path}: picture {source}", "a PNG or JPEG"):
+        with Image.open(source) as opened:  # which reads the size, and no pixels yet
+            width, height = opened.size
+        if width * height > MOST_CELLS:
+            raise DataError(
+                f"{path}: picture {source}: {width} x {height} pixels; expected at most "
+                f"{MOST_CELLS} pixels"
+            )
         picture = np.asarray(imread(source), float)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise DataError(f"{path}: picture {source}: {error}; expected a PNG or JPEG") from error
     if picture.ndim == 2:  # a grey picture has no axis of colours
         picture = np.repeat(picture[..., None], 3, axis=2)
-    if picture.shape[0] * picture.shape[1] > MOST_CELLS:
-        raise DataError(
-            f"{path}: picture {source}: {picture.shape[1]} x {picture.shape[0]} pixels; expected "
-            f"at most {MOST_CELLS} pixels"
-        )
     picture = picture[..., :3] if picture.max() <= 1 else picture[..., :3] / 255
-    wanted = np.array([to_rgb(colour) for colour in given.colours.values()])
-    distance = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)
-    cells = np.argmin(distance, axis=-1)[::-1].copy()
+    cells, least = np.zeros((height, width), np.intp), np.full((height, width), np.inf)
+    for k, colour in enumerate(given.colours.values()):
+        distance = np.linalg.norm(picture - to_rgb(colour), axis=-1)
+        cells[distance < least] = k
+        least = np.minimum(distance, least)
+    cells = cells[::-1].copy()
     return FloorMap(tuple(given.colours), cells, given.corner_m, given.metres_per_pixel)
