@@ -14,7 +14,10 @@ import numpy as np
 
 from slipid.support.errors import DataError
 from slipid.support.folder import temporary_of
-from slipid.support.parsing import arrays_of, json_of
+from slipid.support.parsing import MOST_ARRAY_BYTES, arrays_of, json_of
+
+PIPE = "a pipe or a device; save it to a file first"
+"""What is wrong with a path of no regular file, such as `<(command)` of a shell, in messages."""
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -144,7 +147,7 @@ def read_bytes(path: Path, what: str, most: int = 256 * 2**20) -> bytes:
     try:
         kept = path.stat()
         if not stat.S_ISREG(kept.st_mode):
-            found = "a folder" if stat.S_ISDIR(kept.st_mode) else "not a regular file"
+            found = "a folder" if stat.S_ISDIR(kept.st_mode) else PIPE
             raise DataError(f"{path}: {found}; expected {what}")
         if kept.st_size > most:
             raise DataError(f"{path}: {kept.st_size} bytes; expected {what}, at most {most} bytes")
@@ -177,7 +180,8 @@ def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
         DataError: the file is missing, damaged or too large (see `arrays_of`); the message names
             `what` was expected.
     """
-    raw = read_bytes(path, what)
+    # directories and headers of the file are small, beside arrays of the largest size
+    raw = read_bytes(path, what, MOST_ARRAY_BYTES + 2**20)
     try:
         return arrays_of(raw)
     except ValueError as error:

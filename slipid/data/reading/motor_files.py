@@ -126,7 +126,7 @@ def _rows(format: TableFormat, texts: frozenset[str], layout: Layout) -> Table:
         body = lines_of(format.path)[format.first_data_row - 1 :]
         tests = [[*cells_of(line, format.delimiter), *[""] * at][at] for line in body]
     else:
-        table_of_texts = parquet_of(format.path, bytes_of(format.path))
+        table_of_texts = parquet_of(format.path, bytes_of(format.path), named[:1])
         with refused_as(format.path, f"names of tests in the column '{named[0]}'"):
             tests = [str(cell) for cell in table_of_texts.column(named[0]).to_pylist()]
     return replace(table, tests=np.array(tests))

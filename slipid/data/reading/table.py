@@ -19,16 +19,18 @@ from slipid.data.reading.layout import Channel, Layout
 from slipid.data.reading.units import same_unit
 from slipid.support.errors import bad_data, first_names, refused_as
 from slipid.support.extras import missing
-from slipid.support.files import read_bytes
+from slipid.support.files import PIPE, read_bytes
 
 if TYPE_CHECKING:
     from pyarrow import Table as ParquetTable
+    from pyarrow.parquet import ParquetFile
 
 _DATE = re.compile(r"\d{4}[-/]\d{2}[-/]\d{2}[T ]\d{2}:")
 MISSING = {"", "nan", "na", "n/a", "null", "none"}
 """Contents of cells, in lower case, that mean a missing number."""
 MOST_CELLS = 2**26
-"""Largest number of cells of a Parquet file, which may be compressed a million times."""
+"""Largest number of cells to read of a Parquet file, which may be compressed a million times."""
+_PARQUET = "a complete Parquet file"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +82,11 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     raw = bytes_of(path)
     sha256 = hashlib.sha256(raw).hexdigest()
     if path.suffix == ".parquet":
-        header, values, texts = parquet_numbers(path, raw)
-        names = wanted_names(path, header, layout, all_columns)
-        where = [header.index(name) for name in names]
-        for at in sorted(texts.intersection(where)):
-            raise bad_data(path, "values of another type", "numbers", column=header[at])
-        return Table(path, sha256, names, values[:, where], 1 + np.arange(len(values)))
+        names = wanted_names(path, parquet_names(path, raw), layout, all_columns)
+        values, texts = parquet_numbers(path, raw, names)
+        for at in sorted(texts):
+            raise bad_data(path, "values of another type", "numbers", column=names[at])
+        return Table(path, sha256, names, values, 1 + np.arange(len(values)))
     text = text_lines(path, raw)
     header = header_cells(path, text, layout)
     names = wanted_names(path, header, layout, all_columns)
@@ -125,7 +126,7 @@ def raw_bytes(path: Path, limit: int = -1) -> bytes:
         DataError: the file cannot be read, or is empty.
     """
     if path.exists() and not path.is_file():
-        found = "a folder" if path.is_dir() else "not a regular file"
+        found = "a folder" if path.is_dir() else PIPE
         raise bad_data(path, found, "a CSV or Parquet file")
     try:
         with path.open("rb") as file:
@@ -138,40 +139,62 @@ def raw_bytes(path: Path, limit: int = -1) -> bytes:
     return raw
 
 
-def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
-    """Return the table in the bytes of a Parquet file.
-
-    Raises:
-        DataError: the bytes are not a Parquet file, the table is empty, or pyarrow is missing.
-    """
+def _parquet_file(path: Path, raw: bytes) -> "ParquetFile":
+    """Return an opened Parquet file; raise `DataError` if it is damaged or pyarrow is missing."""
     try:
         import pyarrow
         import pyarrow.parquet as parquet
     except ImportError as error:
         raise missing("parquet", f"{path}: a Parquet file", error) from error
-    with refused_as(path, "a complete Parquet file"):
-        file = parquet.ParquetFile(pyarrow.BufferReader(raw))
-        cells = file.metadata.num_rows * file.metadata.num_columns
-        if not 0 <= cells <= MOST_CELLS:
-            raise bad_data(path, f"{cells} cells", f"at most {MOST_CELLS}; split the file")
-        table = file.read()
-        table.validate(full=True)
-    if not table.num_rows:
+    with refused_as(path, _PARQUET):
+        return parquet.ParquetFile(pyarrow.BufferReader(raw))
+
+
+def parquet_names(path: Path, raw: bytes) -> list[str]:
+    """Return the names of the columns of a Parquet file, without decoding their cells.
+
+    Raises:
+        DataError: the bytes are not a Parquet file, it has no rows, or pyarrow is missing.
+    """
+    file = _parquet_file(path, raw)
+    if not file.metadata.num_rows:
         raise bad_data(path, "no rows", "rows of numbers")
+    with refused_as(path, "names of columns in UTF-8"):
+        return list(file.schema_arrow.names)
+
+
+def parquet_of(path: Path, raw: bytes, names: Sequence[str]) -> "ParquetTable":
+    """Return the named columns in the bytes of a Parquet file; each name occurs once in the file.
+
+    Raises:
+        DataError: the bytes are not a Parquet file, the columns have more than `MOST_CELLS` cells,
+            or pyarrow is missing.
+    """
+    file = _parquet_file(path, raw)
+    with refused_as(path, _PARQUET):
+        # a column of structures is stored as several columns, whose paths begin with its name
+        stored = [file.schema.column(k).path for k in range(file.metadata.num_columns)]
+        count = sum(p.startswith(f"{name}.") or p == name for p in stored for name in names)
+        cells = file.metadata.num_rows * count
+        if not 0 <= cells <= MOST_CELLS:
+            found = f"{cells} cells in the {len(names)} columns to read"
+            raise bad_data(path, found, f"at most {MOST_CELLS}; split the file")
+        table = file.read(columns=list(names)).select(list(names))
+        table.validate(full=True)
     return table
 
 
 def parquet_numbers(
-    path: Path, raw: bytes
-) -> tuple[list[str], Float[np.ndarray, "row column"], frozenset[int]]:
-    """Return the names and numbers of a Parquet file, and the positions of columns of other types.
+    path: Path, raw: bytes, names: Sequence[str]
+) -> tuple[Float[np.ndarray, "row column"], frozenset[int]]:
+    """Return the numbers in columns of a Parquet file, and the positions of those of other types.
 
     Dates and durations become seconds, dates since 1970 in UTC. A column of another type, such as
     strings, has NaN for its numbers.
     """
     import pyarrow
 
-    table = parquet_of(path, raw)
+    table = parquet_of(path, raw, names)
     values, texts = np.full((table.num_rows, table.num_columns), np.nan), set()
     for k, column in enumerate(table.columns):
         try:
@@ -183,8 +206,7 @@ def parquet_numbers(
             values[:, k] = column.cast(pyarrow.float64()).to_numpy()
         except pyarrow.ArrowException:
             texts.add(k)
-    with refused_as(path, "names of columns in UTF-8"):
-        return table.column_names, values, frozenset(texts)
+    return values, frozenset(texts)
 
 
 def text_lines(path: Path, raw: bytes) -> list[str]:

@@ -17,8 +17,8 @@ from slipid.data.reading.table import (
     cell_numbers,
     cells_of,
     number_in,
+    parquet_names,
     parquet_numbers,
-    parquet_of,
     text_lines,
 )
 from slipid.support.errors import bad_data
@@ -92,7 +92,7 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
         DataError: the file cannot be read, is empty, or is not a log with rows of numbers.
     """
     if path.suffix == ".parquet":
-        header = tuple(parquet_of(path, bytes_of(path)).column_names)
+        header = tuple(parquet_names(path, bytes_of(path)))
         return TableFormat(path, "", 1, 0, 2, header, ("",) * len(header))
     lines = first_lines(path)
     delimiter = delimiter or _delimiter_of(lines)
@@ -119,7 +119,7 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
 def numbers_of(format: TableFormat) -> TableNumbers:
     """Return the numbers in the first `ROWS` rows of a file."""
     if not format.delimiter:
-        _, numbers, texts = parquet_numbers(format.path, bytes_of(format.path))
+        numbers, texts = parquet_numbers(format.path, bytes_of(format.path), format.names)
         return TableNumbers(format, numbers[:ROWS], texts)
     lines = lines_of(format.path)
     body = [line for line in lines[format.first_data_row - 1 :][:ROWS] if line.strip()]

@@ -14,7 +14,7 @@ from slipid.data.reading import table
 from slipid.data.reading.bag import unpacking
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.end_poses import read_end_poses
-from slipid.data.reading.table import parquet_numbers
+from slipid.data.reading.table import parquet_names, parquet_numbers
 from slipid.support.errors import DataError, refused_as
 from tests.helpers.made_bags import in_order, joint_states
 from tests.helpers.made_ulogs import write_ulog
@@ -57,9 +57,13 @@ def test_errors_of_pyarrow_become_sentences(name, tmp_path):
     columns = pyarrow.table({"column": np.arange(30.0), "other": np.arange(30)})
     parquet.write_table(columns, path, store_schema=False)
     whole = path.read_bytes()
-    assert parquet_numbers(path, whole)[1].shape == (30, 2)
+    assert parquet_numbers(path, whole, ("column", "other"))[0].shape == (30, 2)
     damaged = DAMAGED_PARQUET[name](whole)
-    refused(path, lambda: parquet_numbers(path, damaged), r"a.parquet: cannot be read \(")
+    refused(
+        path,
+        lambda: parquet_numbers(path, damaged, ("column", "other")),
+        r"a.parquet: cannot be read \(",
+    )
 
 
 def test_a_parquet_file_of_too_many_cells_is_refused_before_it_is_decoded(tmp_path, monkeypatch):
@@ -67,11 +71,18 @@ def test_a_parquet_file_of_too_many_cells_is_refused_before_it_is_decoded(tmp_pa
     from pyarrow import parquet
 
     path = tmp_path / "a.parquet"
-    parquet.write_table(pyarrow.table({"t": np.arange(30), "x": np.arange(30)}), path)
+    columns = {name: np.arange(30) for name in ("z", "x.y", "t", "x")}
+    parquet.write_table(pyarrow.table(columns | {"s": [{"a": 1, "b": 2}] * 30}), path)
     raw = path.read_bytes()
+    monkeypatch.setattr(table, "MOST_CELLS", 60)
+    values, texts = parquet_numbers(path, raw, ("t", "z"))
+    assert values.shape == (30, 2)
+    assert not texts
+    assert parquet_names(path, raw) == ["z", "x.y", "t", "x", "s"]
     monkeypatch.setattr(table, "MOST_CELLS", 59)
-    monkeypatch.setattr(parquet.ParquetFile, "read", lambda self: pytest.fail("decoded"))
-    refused(path, lambda: parquet_numbers(path, raw), "60 cells; expected at most 59")
+    monkeypatch.setattr(parquet.ParquetFile, "read", lambda self, **_: pytest.fail("decoded"))
+    for names in (("t", "z"), ("s",)):
+        refused(path, lambda names=names: parquet_numbers(path, raw, names), "60 cells")
 
 
 # bags
