@@ -21,8 +21,11 @@ from slipid.support.files import (
     write_arrays,
     write_json,
 )
+from slipid.support.parsing import MOST_ARRAY_BYTES
 
 SCHEMA = "slipid.checkpoint/2"
+MOST_PART_BYTES = MOST_ARRAY_BYTES - 2**20
+"""Largest size of the arrays of a part [bytes]; it leaves room for their headers in the file."""
 _LOG = logging.getLogger("slipid")
 LIBRARIES = (
     "slipid",
@@ -101,8 +104,19 @@ class Checkpoint:
     key: str
 
     def save(self, name: str, arrays: Mapping[str, np.ndarray | float | int | str]) -> None:
-        """Write arrays under a name to `<name>.npz`."""
+        """Write arrays under a name to `<name>.npz`.
+
+        Larger arrays than can be loaded are logged instead.
+        """
         content = {k: np.asarray(v) for k, v in arrays.items()}
+        size = sum(array.nbytes for array in content.values())
+        if size > MOST_PART_BYTES:
+            _LOG.warning(
+                "%s: %d bytes, too much for a checkpoint (at most %d); if the job is interrupted, "
+                "this part is computed again",
+                *(self.folder / f"{name}.npz", size, MOST_PART_BYTES),
+            )
+            return
         marks = {"key": np.asarray(self.key), "sha256": np.asarray(_mark(content))}
         write_arrays(self.folder / f"{name}.npz", content | marks, compress=False)
 

@@ -11,7 +11,9 @@ import time
 import numpy as np
 import pytest
 
+from slipid.support import checkpoint, files, parsing
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
+from slipid.support.errors import DataError
 from slipid.support.files import read_arrays, write_arrays
 
 ARRAYS = {"z": np.arange(3.0), "stage": "joint", "round": 4}
@@ -136,6 +138,7 @@ def test_a_key_knows_the_versions(monkeypatch):
 WRITER = """
 import numpy as np
 from pathlib import Path
+from slipid.support import checkpoint, files, parsing
 from slipid.support.checkpoint import Checkpoint
 kept = Checkpoint(Path({folder!r}), "mine")
 for k in range(100_000):
@@ -174,3 +177,17 @@ def test_sources_are_of_packages_and_of_single_modules():
     assert len({one, other, both, source_hash("lab")}) == 4
     with pytest.raises(FileNotFoundError):
         source_hash("no_such_package")
+
+
+def test_parts_that_cannot_be_loaded_are_logged_when_they_are_saved(kept, monkeypatch, caplog):
+    monkeypatch.setattr(checkpoint, "MOST_PART_BYTES", 99)
+    kept.save("large", {"z": np.zeros(13)})
+    assert "104 bytes, too much for a checkpoint (at most 99)" in caplog.text
+    assert not (kept.folder / "large.npz").exists()
+
+
+def test_the_largest_file_of_arrays_has_the_largest_arrays(kept, monkeypatch):
+    assert checkpoint.MOST_PART_BYTES < parsing.MOST_ARRAY_BYTES
+    monkeypatch.setattr(files, "MOST_ARRAY_BYTES", 100 - 2**20)
+    with pytest.raises(DataError, match="at most 100 bytes"):
+        read_arrays(kept.folder / "part.npz", "a part")
