@@ -281,7 +281,7 @@ class LogsSection(Section):
     load: Label = "as_built"
     session: Literal["surface/load/speed", "folder", "file"] = "surface/load/speed"
     session_name: Label | None = None
-    min_rows: Annotated[int, Bounds(2, 1e9)] = 2
+    min_rows: Annotated[int, Bounds(2, 10**9)] = 2
     end_poses: InsidePath | None = None
 
     @model_validator(mode="after")

@@ -121,7 +121,7 @@ def read_dataset(
         skipped.append(f"skipped: {short} runs with fewer rows than the min_rows of their section")
     if not logs:
         nothing = f"{root}: no run in any file of {config.path}; expected logs with a moving robot"
-        raise DataError("\n".join([*aside, *skipped]) or nothing)
+        raise DataError(*([*aside, *skipped] or [nothing]))
     return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
 
 
@@ -161,7 +161,7 @@ def required_files(
         raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
     found, skipped = files_of(config, sections, root)
     if not found:
-        raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
+        raise DataError(*(s.removeprefix("skipped: ") for s in skipped))
     return found, skipped
 
 

@@ -7,7 +7,11 @@ from difflib import get_close_matches
 from pathlib import Path
 
 LONGEST = 500
-"""Largest number of characters of the message of a `DataError`."""
+"""Largest number of characters of a message about one mistake."""
+MOST_MISTAKES = 20
+"""Largest number of mistakes that a `DataError` names."""
+_SHOWN = 60
+"""Number of characters of the start, and of the end, of a long value in a message."""
 _LONG_WORD = re.compile(r"\S{81,}")
 
 
@@ -15,11 +19,16 @@ class DataError(ValueError):
     """Error about wrong input of a user: files, options or configs.
 
     The message names the file, the row or column, and the remedy. It has at most `LONGEST`
-    characters, whatever values of a file it shows.
+    characters, whatever values of a file it shows. An error about several mistakes has a message
+    for each.
     """
 
-    def __init__(self, message: object = "") -> None:
-        super().__init__(_bounded(str(message)))
+    def __init__(self, *messages: object) -> None:
+        super().__init__(*(_bounded(str(message)) for message in messages))
+
+    def __str__(self) -> str:
+        more = len(self.args) - MOST_MISTAKES
+        return "\n".join([*self.args[:MOST_MISTAKES], *[f"... ({more} more)"] * (more > 0)])
 
 
 def _bounded(message: str) -> str:
@@ -33,7 +42,7 @@ def _bounded(message: str) -> str:
     message = _LONG_WORD.sub(lambda m: f"{m[0][:40]}...{m[0][-37:]}", message)
     lines = message.split("\n")
     for count in range(len(lines), 0, -1):
-        more = f"\n... ({len(lines) - count} more lines)" if count < len(lines) else ""
+        more = f"\n... ({len(lines) - count} more)" if count < len(lines) else ""
         kept = "\n".join(lines[:count]) + more
         if len(kept) <= LONGEST:
             return kept
@@ -89,13 +98,17 @@ def refused_as(path: Path | str, expected: str) -> Iterator[None]:
 
 
 def shown(value: object) -> str:
-    """Return a value as messages show it; Python itself writes no integers of over 4300 digits."""
+    """Return a value as messages show it, without its middle if it is long.
+
+    Python itself writes no integers of over 4300 digits.
+    """
     if isinstance(value, int) and value.bit_length() > 64:
         return f"a whole number of {value.bit_length()} bits"
     try:
-        return repr(value)
+        text = repr(value)
     except ValueError:
         return "a value with an integer of thousands of digits"
+    return text if len(text) <= 2 * _SHOWN else f"{text[:_SHOWN]} ... {text[-_SHOWN:]}"
 
 
 def did_you_mean(name: object, choices: Iterable[str]) -> str:

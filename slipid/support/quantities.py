@@ -46,7 +46,8 @@ class Bounds:
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
         sign = ", of either sign" if self.of_size else ""
-        return f"from {self.low:g} to {self.high:g}{unit}{sign}"
+        ends = (str(end) if isinstance(end, int) else f"{end:g}" for end in (self.low, self.high))
+        return f"from {' to '.join(ends)}{unit}{sign}"
 
     def holds(self, value: float | int) -> bool:
         """Return True if a number is within the bounds; NaN is not."""
@@ -123,7 +124,10 @@ def inside(text: str) -> str:
     """
     parts = path_text(text).replace("\\", "/").split("/")
     if parts[0] in ("", "~") or parts[0].endswith(":") or ".." in parts:
-        raise ValueError(f"{text!r} leaves its folder; expected a path inside the folder")
+        raise ValueError(
+            f"{text!r} leaves its folder; expected a path inside the folder: make a link in it, or "
+            "give a higher folder (for logs, with --data)"
+        )
     if set(parts) <= {"", "."}:
         raise ValueError(f"{text!r} is the folder itself; expected files inside it")
     return text

@@ -63,8 +63,26 @@ def checked(
             return TypeAdapter(model).validate_json(json.dumps(mapping), strict=True)
         return TypeAdapter(model).validate_python(mapping)
     except ValidationError as error:
-        lines = dict.fromkeys(_line(path, mapping, model, e) for e in error.errors())
-        raise DataError("\n".join(lines)) from None
+        errors = _of_one_member(mapping, error.errors())
+        raise DataError(*dict.fromkeys(_line(path, mapping, model, e) for e in errors)) from None
+
+
+def _of_one_member(mapping: object, errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
+    """Return the errors without those of the other member of a union of a number and a list.
+
+    Pydantic reports that the number 0 is no list besides that it is too small, and that a list is
+    no number besides what is wrong in the list.
+    """
+    places = [_steps(mapping, error["loc"], missing=False) for error in errors]
+
+    def foreign(k: int) -> bool:
+        kind, is_list = errors[k]["type"], isinstance(errors[k]["input"], list)
+        if kind not in (("value_error",) if is_list else ("list_type",)):
+            return False
+        inside = (j for j, place in enumerate(places) if place[: len(places[k])] == places[k])
+        return any(len(places[j]) > len(places[k]) or errors[j]["type"] != kind for j in inside)
+
+    return [error for k, error in enumerate(errors) if not foreign(k)]
 
 
 def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) -> str:

@@ -24,7 +24,9 @@ from tests.fuzz.damage import damaged
 from tests.fuzz.door import Door, Files, Silent, wrong_number
 
 LONGEST_MESSAGE = 500
-"""Characters of a message of an error."""
+"""Characters of a message about one mistake, which is a line."""
+MOST_LINES = 21
+"""Lines of an error: 20 mistakes, and how many more there are."""
 MOST_SECONDS = 2.0
 """CPU time of a read."""
 MOST_MB = 2048.0
@@ -172,9 +174,15 @@ def _accepted(value: Any) -> Verdict:
     return Verdict("silent", re.sub(r"\d+", "0", wrong)[:80], message=wrong)
 
 
+def too_long(message: str) -> bool:
+    """Return True if a message has too many lines, or too long ones."""
+    lines = message.split("\n")
+    return len(lines) > MOST_LINES or max(map(len, lines)) > LONGEST_MESSAGE
+
+
 def _refused(door: Door, error: DataError, specimen: Files) -> Verdict:
     message, place = str(error), place_of(error.__traceback__)
-    if len(message) > LONGEST_MESSAGE:
+    if too_long(message):
         start = f"{len(message)} characters: {message[:200]}"
         return Verdict("long", "DataError", *place, start)
     known = {part for name in specimen for part in Path(name).parts}

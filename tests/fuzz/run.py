@@ -8,13 +8,13 @@ Case `k` of a door follows from the seed, the door and `k` alone. It is read in 
 own, with limits on CPU time and memory. Verdicts:
 
     accepted    read, and every number is finite
-    refused     a `DataError` of at most 500 characters that names the input
+    refused     a `DataError` of at most 500 characters per mistake that names the input
     traceback   any other exception
     hang        more than 2 s of CPU time, or no end
     memory      more than 2 GB
     silent      read, although numbers are not finite or times do not increase
     outside     a file outside of the folder was written
-    long        a message of more than 500 characters
+    long        a line of more than 500 characters, or more than 21 lines
     nameless    a message that does not name the input
     crash       the process died
 

@@ -15,7 +15,7 @@ from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.presets import declared_layout
 from slipid.support.errors import DataError
 from tests.fuzz import config_doors, hostile, log_doors
-from tests.fuzz.case import LONGEST_MESSAGE
+from tests.fuzz.case import too_long
 from tests.fuzz.door import wrong_number
 
 _SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=30)
@@ -53,7 +53,7 @@ def held(read: Callable[[], Any]) -> bool:
         value = read()
     except DataError as error:
         message = str(error)
-    assert len(message) <= LONGEST_MESSAGE
+    assert not too_long(message)
     assert wrong_number(value) is None
     return not message
 

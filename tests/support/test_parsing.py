@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import io
 import os
+import pickle
 import struct
 import zipfile
+from typing import Annotated
 
 import numpy as np
 import pytest
+from pydantic import Field
 
-from slipid.support.errors import LONGEST, DataError
+from slipid.support.errors import LONGEST, DataError, shown
 from slipid.support.files import read_arrays, read_bytes, read_json
 from slipid.support.parsing import json_of, toml_of
+from slipid.support.quantities import Positive
+from slipid.support.toml_file import Section, checked
 
 DEEP = "[" * 40 + "]" * 40
 
@@ -142,7 +147,7 @@ def test_only_regular_files_of_a_usual_size_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "large").write_bytes(b"0" * 101)
     for name, expected in (
-        ("pipe", "not a regular file"),
+        ("pipe", "a pipe or a device; save it to a file first"),
         (".", "a folder"),
         ("large", "101 bytes; expected a thing, at most 100 bytes"),
         ("none", "No such file"),
@@ -150,7 +155,7 @@ def test_only_regular_files_of_a_usual_size_are_read(tmp_path):
     ):
         with pytest.raises(DataError, match=expected):
             read_bytes(tmp_path / name, "a thing", 100)
-    with pytest.raises(DataError, match="not a regular file"):
+    with pytest.raises(DataError, match="a pipe or a device; save it to a file first"):
         read_json(tmp_path / "pipe", "a thing")
 
 
@@ -176,3 +181,40 @@ def test_a_long_message_keeps_what_is_short():
     message = str(DataError(f"c.toml: logs.glob '{'g' * 3000}'; expected a glob\nc.toml: other"))
     assert message.startswith("c.toml: logs.glob 'ggg")
     assert message.endswith("expected a glob\nc.toml: other")
+
+
+def test_each_mistake_has_its_line():
+    long = [f"c.toml: key{k}: {'v ' * 150}; expected a number" for k in range(25)]
+    error = DataError(*long[:3])
+    assert str(error).split("\n") == long[:3]
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+    many = DataError(*long)
+    assert str(many).split("\n") == [*long[:20], "... (5 more)"]
+    assert str(pickle.loads(pickle.dumps(many))) == str(many)
+    assert len(str(DataError("w " * 900, "b")).split("\n")[0]) == LONGEST
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (0, "a: x: 0; expected a number from 1e-12 to 1e+12"),
+        ([1, 0], "a: x[2]: 0; expected a number from 1e-12 to 1e+12"),
+        ([], "a: x: []; expected: list should have at least 1 item after validation, not 0"),
+        ({}, "a: x: {}; expected a number from 1e-12 to 1e+12"),
+    ],
+)
+def test_a_number_or_a_list_of_them_has_one_mistake(given, message):
+    class OneOrMany(Section):
+        x: Positive | Annotated[list[Positive], Field(min_length=1)]
+
+    with pytest.raises(DataError) as caught:
+        checked("a", {"x": given}, OneOrMany)
+    assert str(caught.value) == message
+
+
+def test_a_long_value_loses_its_middle():
+    assert shown(list(range(9))) == "[0, 1, 2, 3, 4, 5, 6, 7, 8]"
+    text = shown(list(range(10**5)))
+    assert len(text) == 125
+    assert text.startswith("[0, 1, 2,")
+    assert text.endswith("99998, 99999]")

@@ -246,7 +246,7 @@ def formats_below(folder: Path) -> tuple[list[TableFormat], dict[Path, str]]:
     if not found:
         there = f"no log in {len(paths)} files" if paths else "no CSV or Parquet file below it"
         listed = list(not_logs.values())[:3]
-        raise DataError("\n".join([f"{folder}: {there}; expected logs of a robot", *listed]))
+        raise DataError(f"{folder}: {there}; expected logs of a robot", *listed)
     return found, not_logs
 
 

@@ -160,7 +160,7 @@ def _read(config: Config, name: str, root: Path, report: Reporter) -> tuple[Runs
     numbers = [k for k, log in enumerate(runs.logs) if log.name == name or len(runs) == 1]
     if not numbers:
         there = first_names(log.name for log in runs.logs)
-        raise DataError("\n".join([f"{root}: no run '{name}'; expected one of {there}", *aside]))
+        raise DataError(f"{root}: no run '{name}'; expected one of {there}", *aside)
     return runs.subset(numbers), section
 
 

@@ -73,9 +73,9 @@ AT_RIM = {"wheel_angle": "m", "wheel_speed": "m/s", "wheel_speed_command": "m/s"
 TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
 """Channels from which the turns of the wheels can be computed; the first available one is used."""
 
-RowNumber = Annotated[int, Bounds(0, 1e6)]
+RowNumber = Annotated[int, Bounds(0, 10**6)]
 """Number of a row of a file, counted from 1; 0 for none."""
-Position = Annotated[int, Bounds(0, 1e5)]
+Position = Annotated[int, Bounds(0, 10**5)]
 """Position of a column, counted from 0."""
 
 

@@ -83,7 +83,7 @@ def read_runs(
         logs += found.logs
         aside += found.aside
     if not logs and aside:
-        raise DataError("\n".join(aside))
+        raise DataError(*aside)
     return collect(counted_once(logs), [session_of(log, session) for log in logs], aside)
 
 
@@ -209,7 +209,10 @@ def matching(root: Path, pattern: str) -> list[Path]:
     try:
         levels = Path(inside(pattern)).parts
         if levels.count("**") > 1:
-            raise ValueError(f"'{pattern}' has several **; expected at most one")
+            raise ValueError(
+                f"'{pattern}' has several **; expected at most one: write * for each level of "
+                "folders in place of the others"
+            )
         if "**" in levels:
             fixed = takewhile(lambda part: not set(part) & set("*?["), levels)
             walk = os.walk(root.joinpath(*fixed))

@@ -33,7 +33,7 @@ class MotorBuild:
     efficiency: Annotated[float, Bounds(1e-3, 1)] = 0.9
     supply_v: Annotated[float, Bounds(0.1, 1e4, "V")] = 24.0
     supply_ohm: Annotated[float, Bounds(0, 1e3, "ohm")] = 0.15
-    ticks_per_revolution: Annotated[int, Bounds(10, 1e9)] = 2000
+    ticks_per_revolution: Annotated[int, Bounds(10, 10**9)] = 2000
 
 
 @dataclass(frozen=True, config=CLOSED)
