@@ -40,6 +40,8 @@ _RESULT = "the result of `slipid identify`"
 SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/9"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
+_LARGEST = 1e18
+"""Largest magnitude in the covariance of the search vector, and in its inverse."""
 _SHARED = ("std", "coefs", "by_number", "covariance")
 _MIXED = ("mixed", "refused")
 _SHAPE = ("place", "drive_angle", "roller_angle", "grips", "drive_of", "gear_ratio")
@@ -297,10 +299,24 @@ def _effects(
     return FittedEffects(tuple(SpeedAndLoad(**pace) for pace in paces), **parts)
 
 
+def _check_covariance(found: np.ndarray) -> None:
+    """Raise `ValueError` for a matrix that is no covariance, or that verdicts cannot invert."""
+    if np.diag(found).min(initial=0) < 0:
+        raise ValueError("negative variances; expected a covariance")
+    np.linalg.cholesky(found)  # whose LinAlgError is a ValueError
+    inverse = np.linalg.inv(found)
+    large = max(np.abs(found).max(initial=0), np.abs(inverse).max(initial=0))
+    scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
+    if (np.abs(found - found.T) > 1e-6 * scale).any() or not large < _LARGEST:
+        raise ValueError("not symmetric, or singular; expected a covariance")
+
+
 def _check(fit: Fit) -> None:
     """Raise `ValueError` if parts of a fit contradict each other, or a value is not finite."""
-    if min(np.diag(fit.covariance).min(initial=0), np.diag(fit.laplace).min(initial=0)) < 0:
-        raise ValueError("negative variances; expected a covariance")
+    for found in (fit.covariance, fit.laplace):
+        _check_covariance(found)
+    if fit.chain is not None and not fit.chain.z.size:
+        raise ValueError("a chain without draws")
     with np.errstate(over="ignore"):
         for e in entries(fit.robot):
             if not np.isfinite(np.asarray(e.get(fit.robot))).all():
