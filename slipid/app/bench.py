@@ -28,7 +28,7 @@ from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
 from slipid.infer.bench.rows import Between
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.infer.feedforward import bench_feedforwards
-from slipid.infer.result_folder import files_of_fit
+from slipid.infer.result_folder import CONFIG, FIT, IDENTIFIED, files_of_fit
 from slipid.parameter import entries
 from slipid.search_space import Choice
 from slipid.support.content import Content
@@ -272,13 +272,23 @@ def identify_bench(
         data: folder of the logs.
         out: folder to write to.
         report: reporter of the progress.
+
+    Raises:
+        DataError: a log is wrong, or the folder has the result of a robot.
     """
+    if (out / FIT).exists():
+        raise DataError(
+            f"{out}: has the fit of a robot ({FIT}); choose a different folder with --out"
+        )
     began = time.monotonic()
     task = read_bench_task(config, data, report)
     fit = task.fit(report)
     writable(out)
     content = bench_content(fit)
-    write_together({out / "identified.json": json_text(content).encode()}, files_of_fit(out))
+    files = {IDENTIFIED: json_text(content), CONFIG: config.text}
+    write_together(
+        {out / k: v.encode() for k, v in files.items()}, files_of_fit(out, keep_config=True)
+    )
     gains = write_gains(out, bench_feedforwards(fit))
 
     inputs: Content = {

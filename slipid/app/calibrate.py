@@ -17,7 +17,7 @@ from slipid.data.wheel_signals import interpolate
 from slipid.fitting.calibration.result import ABSURD, Calibration
 from slipid.infer.fit_file import SCHEMA
 from slipid.infer.result_content import AGAIN, IdentifiedContent, checked_result
-from slipid.infer.result_folder import FIT, IDENTIFIED, files_of_fit, fit_of
+from slipid.infer.result_folder import CONFIG, FIT, IDENTIFIED, files_of_fit, fit_of
 from slipid.infer.verdicts.trust import Trust, verdict_of_trust
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
@@ -257,7 +257,10 @@ def calibrate_only(
     }
     content = json.loads(json_text(content))
     content |= {"fit": checksum(content)}
-    write_together({out / IDENTIFIED: json_text(content).encode()}, files_of_fit(out))
+    files = {IDENTIFIED: json_text(content), CONFIG: task.config.text}
+    write_together(
+        {out / k: v.encode() for k, v in files.items()}, files_of_fit(out, keep_config=True)
+    )
     write_run(task, found.trust, data, out, time.monotonic() - began)
     return replace(found, written=(IDENTIFIED, "run.json", "config.toml"))
 
@@ -300,7 +303,7 @@ def read_calibration(out: Path) -> CalibrationFile:
 
 
 def write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:
-    """Write run.json, and copies of config, maps and bench file, which later commands read."""
+    """Write run.json, and copies of maps and bench file, which later commands read."""
     config = task.config
     if (bench := bench_of(config)) is not None:
         write_json(out / COPY_NAME, read_json(bench[0], "the parameters of a motor"))

@@ -46,6 +46,8 @@ NEAR_OPTIMUM = 3
 """Round number given to a start near the optimum, so that the fit does not repeat its first rounds,
 which take more steps."""
 CHECKPOINT = "checkpoint"
+LATER = ("posterior.nc", "validation.json", "trial.json", "design.json")
+"""Names of files that later commands make from a fit, which take long to make again."""
 """Name, without suffix, of the file with the state of an unfinished fit."""
 
 
@@ -111,7 +113,7 @@ def identify(
 
     fit, problem, optimum = fitted(task, report, begin)
     report.stage("writing")
-    written = (*save(fit, out), "run.json", "config.toml")
+    written = (*save(fit, out, task.config.text), "run.json", "config.toml")
     write_run(task, fit.trust, data, out, time.monotonic() - began)
     if profiles and task.mixed:
         report.line("profiles use only the runs on one floor each")
@@ -160,16 +162,19 @@ def checked_task(
 
 
 def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
-    """Return a sentence if a folder has a fit of another config or of other logs, else None."""
+    """Return a sentence on the fit in a folder, and on later results that go with it, or None."""
     try:
         before = read_run_file(out)
     except DataError:
         return None
+    later = ", ".join(name for name in LATER if (out / name).exists())
     same = before.config.sha256 == task.config.hash
     if same and before.data.hash == task.data_hash:
-        return None
-    other = "other logs" if same else f"another {before.config.name}"
-    return f"{out} has a fit of {other}; it is replaced when this one is done"
+        stays = f"{out} has {later} of an earlier fit: deleted unless the new fit is the same"
+        return stays if later else None
+    other = "other logs" if same else f"a different {before.config.name}"
+    deleted = f", and {later} deleted" if later else ""
+    return f"{out} has a fit of {other}; it is replaced{deleted} when this one is done"
 
 
 def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:

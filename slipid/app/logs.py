@@ -252,7 +252,7 @@ def layout_of(config: Config, section: LogsSection) -> AnyLayout:
 def write_run_file(
     out: Path, config: Config, inputs: Content, seconds: float, more: Content
 ) -> None:
-    """Write a copy of the config, and run.json, which describes how results were made.
+    """Write run.json, which describes how results were made.
 
     Args:
         out: folder to write to.
@@ -261,7 +261,6 @@ def write_run_file(
         seconds: duration of the computation [s].
         more: further content.
     """
-    write_bytes(out / "config.toml", config.text.encode())
     content = {
         "schema": "slipid.run/1",
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -22,7 +22,7 @@ from slipid.fitting.shared_effects import FittedEffects, SpeedAndLoad
 from slipid.infer.held_out import HeldOut
 from slipid.infer.result import Channels, Fit
 from slipid.infer.result_content import AGAIN, FitContent, checked_result
-from slipid.infer.result_folder import FIT, IDENTIFIED, files_of_fit, fit_of
+from slipid.infer.result_folder import CONFIG, FIT, IDENTIFIED, files_of_fit, fit_of
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.draws import Draws
 from slipid.infer.verdicts.estimates import Estimate
@@ -47,8 +47,16 @@ _MIXED = ("mixed", "refused")
 _SHAPE = ("place", "drive_angle", "roller_angle", "grips", "drive_of", "gear_ratio")
 
 
-def save(fit: Fit, folder: Path) -> tuple[str, ...]:
-    """Write a fit to a folder, replacing a fit there, and return the names of the files.
+def save(fit: Fit, folder: Path, config: str | None = None) -> tuple[str, ...]:
+    """Write a fit to a folder, and return the names of the files.
+
+    A different fit in the folder is replaced, and all files that depend on it are deleted. If the
+    folder has the same fit, they stay.
+
+    Args:
+        fit: the fit.
+        folder: folder to write to.
+        config: text of the config, which is written together with the fit, or None.
 
     Raises:
         ValueError: a value is not finite; in this case nothing is written.
@@ -62,7 +70,12 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
     content |= {"checksum": checksum(content)}
     table = json_text(identified_json(fit) | {"fit": content["checksum"]})
     files = {name: arrays, FIT: json_text(content).encode(), IDENTIFIED: table.encode()}
-    write_together({folder / k: data for k, data in files.items()}, files_of_fit(folder))
+    if config is not None:
+        files[CONFIG] = config.encode()
+    write_together(
+        {folder / k: data for k, data in files.items()},
+        files_of_fit(folder, content["checksum"], keep_config=config is not None),
+    )
     for old in folder.glob("fit-????????????.npz"):
         if old.name != name:
             old.unlink()

@@ -5,6 +5,7 @@ read several files compare them with `fit_of`. Before a fit is replaced, the fil
 are deleted, see `files_of_fit`; thus what a killed command leaves is incomplete, but never mixed.
 """
 
+from contextlib import suppress
 from pathlib import Path
 
 from slipid.support.errors import DataError
@@ -14,7 +15,7 @@ FIT, IDENTIFIED, RUN, CONFIG, ROBOT = (
     *("fit.json", "identified.json", "run.json", "config.toml", "robot.json"),
 )
 OF_FIT = (
-    *(RUN, ROBOT, "evidence.json", "report.html"),
+    *(ROBOT, "evidence.json", "report.html"),
     *("slip_by_heading.png", "slip_by_torque.png", "paths.png", "current_by_traction.png"),
     *("load_share.png", "profile.json", "profile.png", "bench.png"),
     *("motor_feedforward.h", "motor_feedforward.yaml"),
@@ -23,28 +24,38 @@ OF_FIT = (
     *("design.json", "design.png", "design_commands.csv", "trial.json", "trial.png"),
     IDENTIFIED,
 )
-"""Names of the files in a result folder that depend on a fit, besides fit.json and its arrays.
+"""Names of the files in a result folder that depend on a fit, besides fit.json and its arrays,
+run.json and the copy of the config.
 
 They are deleted in this order. The last one shows that the folder has a result."""
 _AGAIN = "run `slipid identify` again"
 
 
-def files_of_fit(folder: Path) -> list[Path]:
+def files_of_fit(folder: Path, new: str = "", keep_config: bool = False) -> list[Path]:
     """Return the paths of the files that depend on the fit in a folder, present or not.
 
-    The copy of the config is not among them: it is replaced while run.json is absent. A folder
-    without a fit has none: a robot.json in it is not slipid's to delete.
+    A folder without a fit has none: a robot.json in it is not slipid's to delete.
+
+    Args:
+        folder: the result folder.
+        new: checksum of the fit that is about to be written; there is nothing to delete if the
+            folder already has it.
+        keep_config: True if the copy of the config is not among the files, since it is written
+            anew; it may be the only copy, and is never absent then.
     """
     if not any((folder / name).exists() for name in (FIT, IDENTIFIED)):
         return []
-    return [folder / name for name in OF_FIT]
+    with suppress(DataError):  # a damaged fit is replaced like any other
+        if new and fit_of(folder) == new:
+            return []
+    return [folder / name for name in ((RUN,) if keep_config else (RUN, CONFIG)) + OF_FIT]
 
 
 def fit_of(folder: Path) -> str | None:
     """Return the checksum of the fit in a folder, None if there is none or its files lack it.
 
-    For a calibration alone it is the checksum in identified.json. Files without a checksum, which
-    older versions wrote, are not compared.
+    For a calibration alone it is the checksum in identified.json. A run.json of an older version
+    has none, and is not compared.
 
     Raises:
         DataError: files in the folder are of different fits, or the writing of a fit was
@@ -52,6 +63,8 @@ def fit_of(folder: Path) -> str | None:
     """
     marks = {FIT: _under(folder / FIT, "checksum")}
     marks |= {name: _under(folder / name, "fit") for name in (IDENTIFIED, RUN)}
+    if marks[FIT] is not None and (folder / IDENTIFIED).exists():
+        marks[IDENTIFIED] = marks[IDENTIFIED] or "none"
     known = {name: mark for name, mark in marks.items() if mark is not None}
     first = next(iter(known), None)
     for name, mark in known.items():

@@ -33,8 +33,9 @@ def write_together(content: Mapping[Path, bytes], outdated: Iterable[Path] = ())
     """Write several files, each atomically, after all of them fit on the disk.
 
     If a file cannot be written, all old files stay as they are. Otherwise outdated files are
-    deleted, and the new files then appear in the given order. If the process is killed in between,
-    the last file is thus missing if it was among the outdated ones.
+    deleted, except links through which a file is written, and the new files then appear in the
+    given order. If the process is killed in between, the last file is thus missing if it was among
+    the outdated ones.
 
     Args:
         content: content of each file, keyed by its path, which may be a symbolic link to the file.
@@ -45,6 +46,10 @@ def write_together(content: Mapping[Path, bytes], outdated: Iterable[Path] = ())
     """
     temporary: dict[Path, Path] = {}
     path = Path()
+    removed = [path for path in outdated if not (path in content and path.is_symlink())]
+    for path in removed:
+        if path.is_dir() and not path.is_symlink():
+            raise DataError(f"{path}: a folder; expected a file that is replaced; move it away")
     try:
         for path, data in content.items():
             target = target_of(path)
@@ -54,7 +59,7 @@ def write_together(content: Mapping[Path, bytes], outdated: Iterable[Path] = ())
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-        for path in outdated:
+        for path in removed:
             path.unlink(missing_ok=True)
         for path, partial in temporary.items():
             partial.replace(path)
@@ -88,7 +93,7 @@ def target_of(path: Path) -> Path:
         raise DataError(f"{str(path)[:80]}: cannot be written ({reason})") from error
     # /dev/stdout leads to a file if the output is redirected; replacing this would lose the output
     _, *above = path.absolute().parts[:3]
-    if above[:1] in (["dev"], ["proc"]) and above != ["dev", "shm"]:
+    if os.name == "posix" and above[:1] in (["dev"], ["proc"]) and above != ["dev", "shm"]:
         kind = "a device or a pipe"
     if kind is not None:
         raise DataError(f"{path}: cannot be written ({kind}); expected the name of a file")

@@ -9,11 +9,8 @@ from pathlib import Path
 
 from slipid.support.errors import DataError
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
+HAS_LOCKS = os.name == "posix"
+"""True if the system has locks that end with their process."""
 LOCK = ".slipid.lock"
 """Name of the file that the writer of a folder locks; it names the writer."""
 MOST_NAME_BYTES = 200
@@ -23,7 +20,7 @@ MOST_NAME_BYTES = 200
 def temporary_of(path: Path) -> Path:
     """Return a new temporary path beside a file, from which the file is renamed."""
     name = path.name.encode()[:MOST_NAME_BYTES].decode(errors="ignore")
-    return path.parent / f".{name}.{secrets.token_hex(4)}"
+    return path.parent / f".{name}.slipid-{secrets.token_hex(4)}"
 
 
 def name_of_temporary(name: str) -> str | None:
@@ -31,7 +28,7 @@ def name_of_temporary(name: str) -> str | None:
 
     `name` may contain folders.
     """
-    match = re.fullmatch(r"((?:.*/)?)\.(.+)\.[0-9a-f]{8}", name)
+    match = re.fullmatch(r"((?:.*/)?)\.(.+)\.slipid-[0-9a-f]{8}", name)
     return None if match is None else match[1] + match[2]
 
 
@@ -40,8 +37,8 @@ def locked(folder: Path | None, command: str) -> Iterator[None]:
     """Return a context in which no other command of slipid writes to a folder.
 
     The folder is made if necessary. Temporary files that killed commands left in it are deleted.
-    The system releases the lock when the process ends, however it ends. File systems without locks
-    are used without one.
+    The system releases the lock when the process ends, however it ends. Systems and file systems
+    without locks are used without one.
 
     Args:
         folder: the folder; None for a command that writes to none.
@@ -52,6 +49,10 @@ def locked(folder: Path | None, command: str) -> Iterator[None]:
             be written.
     """
     if folder is None:
+        yield
+        return
+    if not HAS_LOCKS:
+        _remove_leftovers(folder)
         yield
         return
     new = [path for path in (folder, *folder.parents) if not path.exists()]
@@ -71,18 +72,18 @@ def locked(folder: Path | None, command: str) -> Iterator[None]:
 
 def _locked_file(folder: Path, owner: str) -> int:
     """Return the descriptor of the locked file in a folder; the file then names its owner."""
+    import fcntl
+
     path = folder / LOCK
     while True:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            lock = _opened(path)
         except OSError as error:
-            raise DataError(
-                f"{folder}: cannot be written ({error.strerror}); expected a writable folder"
-            ) from error
+            found = "a file" if folder.is_file() else f"cannot be written ({error.strerror})"
+            raise DataError(f"{folder}: {found}; expected a writable folder") from error
         try:
-            if fcntl is not None:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             other = os.pread(lock, 100, 0).decode(errors="replace") or "a different command"
             os.close(lock)
@@ -102,10 +103,23 @@ def _locked_file(folder: Path, owner: str) -> int:
         os.close(lock)
 
 
+def _opened(path: Path) -> int:
+    """Return the descriptor of a lock file, which is made if necessary."""
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except PermissionError:
+        # a different user's file, left by a killed command, can be locked without writing to it
+        return os.open(path, os.O_RDONLY)
+
+
 def _remove_leftovers(folder: Path) -> None:
-    """Delete the temporary files in a folder and in its subfolders, but not in hidden ones."""
+    """Delete the temporary files in a folder and in its subfolders.
+
+    Hidden subfolders, and those with a lock of their own, are left to those who use them.
+    """
     for root, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
+        inner = [name for name in folders if not name.startswith(".")]
+        folders[:] = [name for name in inner if not (Path(root) / name / LOCK).exists()]
         for name in filter(name_of_temporary, files):
             with suppress(OSError):
                 (Path(root) / name).unlink()

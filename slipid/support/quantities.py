@@ -1,7 +1,7 @@
 """Kinds of numbers and paths in configs, layouts and maps, each with the bounds that it may have.
 
 The bounds hold every robot, from a toy of 1 cm to a mining truck, with decades to spare. A value
-beyond them is a slip of the pen or another unit, and would only overflow later, in computations.
+beyond them is a typing error or has a different unit, and would overflow in later computations.
 """
 
 from dataclasses import dataclass

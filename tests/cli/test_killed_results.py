@@ -176,10 +176,36 @@ def test_every_file_of_a_result_is_known_to_depend_on_the_fit(small, sampled):
 
     drawn = {*fit.FIGURES, *(f"posterior_{name}" for name in posterior.FIGURES)}
     assert {f"{name}.png" for name in drawn} <= {*OF_FIT}
+    plain = {"sampling", "fit.json", "config.toml", "run.json"}
     for out in (small[0] / "out", sampled[0]):
         arrays = json.loads((out / "fit.json").read_text())["arrays"]["file"]
-        names = {p.name for p in out.iterdir()} - {"sampling", "fit.json", "config.toml", arrays}
+        names = {p.name for p in out.iterdir()} - plain - {arrays}
         assert names <= {*OF_FIT}
+
+
+def test_the_same_fit_again_keeps_what_was_made_from_it(refits, sampled, tmp_path):
+    whole(refits, sampled[0], tmp_path)
+    (tmp_path / "posterior.nc").unlink()  # the page refuses that of a different fit
+    before = {p.name for p in tmp_path.iterdir()}
+    load(tmp_path).save(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == before
+    refits.write(tmp_path, BEFORE)
+    assert {p.name for p in tmp_path.iterdir()} == before
+    replace(load(tmp_path), remaining=SECOND).save(tmp_path)  # no config is known to this one
+    assert load(tmp_path).remaining == SECOND
+    arrays = json.loads((tmp_path / "fit.json").read_text())["arrays"]["file"]
+    kept = {"mine.txt", "fit.json", "identified.json", arrays}
+    assert {p.name for p in tmp_path.iterdir()} == kept
+
+
+def test_an_identified_json_without_its_fit_is_refused(refits, tmp_path):
+    refits.write(tmp_path, FIRST)
+    path = tmp_path / "identified.json"
+    content = json.loads(path.read_text())
+    del content["fit"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=r"belongs to a different fit than fit\.json"):
+        load(tmp_path)
 
 
 def test_a_robot_or_a_posterior_of_a_different_result_is_refused(refits, sampled, tmp_path):

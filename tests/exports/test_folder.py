@@ -116,7 +116,7 @@ def test_a_folder_that_was_cut_short_can_be_written_again(folder, monkeypatch):
 
 
 def test_what_a_killed_process_left_is_cleared(folder):
-    for name in ("c/src/.slipid.c.0123abcd", f".{SUMS}.89abcdef"):
+    for name in ("c/src/.slipid.c.slipid-0123abcd", f".{SUMS}.slipid-89abcdef"):
         (folder / name).write_text("a par")
     with pytest.raises(DataError, match="added after the export"):
         check_folder(folder)

@@ -84,6 +84,19 @@ def test_files_that_belong_together_stay_old_where_one_cannot_be_written(tmp_pat
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b", "c"]
 
 
+def test_a_link_through_which_a_file_is_written_is_not_deleted(tmp_path):
+    target, link, folder = tmp_path / "target", tmp_path / "link", tmp_path / "folder"
+    target.touch()
+    link.symlink_to(target)
+    folder.mkdir()
+    with pytest.raises(DataError, match="folder: a folder; expected a file"):
+        write_together({link: b"1"}, [target, folder])
+    assert target.read_bytes() == b""
+    write_together({link: b"1"}, [link])
+    assert link.is_symlink()
+    assert target.read_bytes() == b"1"
+
+
 def test_a_full_disk_leaves_the_old_files(small_disk):
     a, b = small_disk / "a", small_disk / "b"
     write_together({a: b"old", b: b"old"})

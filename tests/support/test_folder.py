@@ -56,7 +56,8 @@ def test_a_folder_that_was_made_for_nothing_is_removed_with_those_above(tmp_path
 
 
 def test_leftovers_of_killed_commands_are_deleted_and_nothing_else(tmp_path):
-    kept = [".hidden", "a.json", ".a.json.0123456", "a.json.01234567", ".git/.x.json.01234567"]
+    kept = [".hidden", "a.json", ".bashrc.20240131", ".a.slipid-0123456", "a.slipid-01234567"]
+    kept += [".git/.x.json.slipid-01234567", "used/.x.json.slipid-01234567", f"used/{LOCK}"]
     left = [temporary_of(tmp_path / name) for name in ("a.json", "sub/b.npz", "n" * 255)]
     for path in (*left, *(tmp_path / name for name in kept)):
         path.parent.mkdir(exist_ok=True)
@@ -66,6 +67,33 @@ def test_leftovers_of_killed_commands_are_deleted_and_nothing_else(tmp_path):
         pass
     assert not any(path.exists() for path in left)
     assert all((tmp_path / name).exists() for name in kept)
+
+
+def test_a_lock_that_cannot_be_written_can_be_taken(tmp_path, monkeypatch):
+    opened = os.open
+
+    def not_mine(path, flags, *mode):
+        if flags & os.O_RDWR:
+            raise PermissionError(13, "Permission denied")
+        return opened(path, flags, *mode)
+
+    (tmp_path / LOCK).write_text("somebody else, long ago")
+    monkeypatch.setattr(os, "open", not_mine)
+    with (
+        locked(tmp_path, "identify"),
+        pytest.raises(DataError, match="long ago is writing"),
+        locked(tmp_path, "sample"),
+    ):
+        pass
+
+
+def test_a_file_is_no_folder(tmp_path):
+    (tmp_path / "a.csv").touch()
+    with (
+        pytest.raises(DataError, match=r"a\.csv: a file; expected a writable folder"),
+        locked(tmp_path / "a.csv", "design"),
+    ):
+        pass
 
 
 def test_where_locks_are_not_supported_work_goes_on(tmp_path, monkeypatch):

@@ -152,8 +152,8 @@ class Board(PrintedBoard):
 class Chessboard(PrintedBoard):
     """A chessboard without markers, detected only where all its inner corners are in view.
 
-    Nothing tells a board from the same board turned by half a turn, so its corners determine a lens
-    but not the axes of a floor.
+    A board cannot be distinguished from the same board after half a turn, so its corners determine
+    a lens but not the axes of a floor.
     """
 
     def __post_init__(self) -> None:

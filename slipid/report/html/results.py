@@ -146,14 +146,16 @@ def _content(path: Path, what: str) -> Content:
 def _outdated(out: Path, fit: str | None, data_hash: object) -> tuple[str, ...]:
     """Return the names of later commands whose files are of a different fit, or of other logs.
 
-    Files of older versions do not name their fit, and are kept.
+    Files of older versions, which do not name their fit, are of it if they are not older.
     """
+    made = (out / IDENTIFIED).stat().st_mtime
 
     def is_of_fit(name: str) -> bool:
         path = out / f"{name}.json"
         found = _content(path, "the result of a command of slipid") if path.exists() else {}
         if name != "comparison":
-            return found.get("fit") in (None, fit)
+            mark = found.get("fit")
+            return mark == fit if mark is not None else not found or path.stat().st_mtime >= made
         of = found.get("data")  # a comparison is made from logs, without the fit
         return not isinstance(of, dict) or of.get("hash") == data_hash
 
