@@ -206,7 +206,8 @@ class PlaceUncertainty:
     """Uncertainty of a camera's pose above the floor.
 
     Attributes:
-        pose: covariance of turn [rad] and shift [m], including the lens's uncertainty.
+        pose: covariance of turn [rad] and of the shift [m] of the floor below the points' middle,
+            including the lens's uncertainty.
         place_std_m: std of the lens's position in the world [m].
         tilt_std_deg: std of the angle between the lens's axis and straight down [deg].
         scale_std: relative std of lengths on the floor if the board's size were exact [1].
@@ -232,7 +233,7 @@ def uncertainty(
         fit: the fit of the pose; its residuals give the variance of the points' errors.
         of_lens: covariance of the lens's parameters; None if it is not known.
     """
-    lens = fit.camera.lens
+    lens, fit = fit.camera.lens, _centred(fit)
     at = np.concatenate([fit.pose.turn, fit.pose.shift, parameters_of(lens)])
     joint = _joint(fit, of_lens)
 
@@ -250,6 +251,18 @@ def uncertainty(
         float(np.degrees(np.sqrt(np.linalg.eigvalsh(spread[3:5, 3:5])[-1]))),
         float(np.sqrt(spread[5, 5])),
     )
+
+
+def _centred(fit: FloorFit) -> FloorFit:
+    """Return a fit with the origin of the world below or above the middle of its points.
+
+    Far from the origin, as with coordinates of UTM, an error of the turn would move the camera by
+    more than the steps of derivatives allow.
+    """
+    middle = fit.points.places.mean(0) * [1, 1, 0]
+    points = replace(fit.points, places=fit.points.places - middle)
+    pose = Pose(fit.pose.turn, fit.pose.shift + fit.pose.rotation @ middle)
+    return replace(fit, camera=camera_of(fit.camera.lens, pose), pose=pose, points=points)
 
 
 def _joint(

@@ -9,12 +9,13 @@ from jaxtyping import Float
 
 from slipid.camera.csv_rows import csv_rows
 from slipid.support.errors import DataError, bad_data, did_you_mean
+from slipid.support.quantities import Bounds, Coordinate, limits_of
 
 COLUMNS = ("u", "v", "x", "y")
 EXPECTED = "u, v (pixels), x, y (metres) and perhaps z"
 """Columns of a file of points, for messages."""
-MOST_PIXEL, MOST_M = 1e5, 1e5
-"""Largest size of a pixel coordinate [pixel] and of a coordinate on the floor [m]."""
+PIXEL = Bounds(-1e5, 1e5, "pixels")
+"""Bounds of a coordinate in an image."""
 LEAST_POINTS = 4
 """Smallest number of points that determine the pose of a camera."""
 LINE_WIDTH = 0.02
@@ -110,8 +111,8 @@ def _number(path: Path, line: int, row: list[str], name: str, header: list[str])
         value = float(text)
     except ValueError:
         value = math.nan
-    most = MOST_PIXEL if name in ("u", "v") else MOST_M
-    if not abs(value) <= most:
+    bounds = PIXEL if name in ("u", "v") else limits_of(Coordinate)
+    if not bounds.holds(value):
         shown = f"'{text}'" if text else "nothing"
-        raise bad_data(path, shown, f"a number from -{most:g} to {most:g}", row=line, column=name)
+        raise bad_data(path, shown, f"a number {bounds}", row=line, column=name)
     return value

@@ -29,6 +29,9 @@ from tests.helpers.calibrated import (
     picture,
 )
 
+FAR = np.array([5e5, 5.4e6, 0.0])
+"""An easting and a northing of UTM [m]."""
+
 
 def test_the_lying_board_gives_the_place(calibrated, folder):
     camera = floor_from_board(calibrated, BOARD, folder / "floor.png", 0.0, 0.001).camera
@@ -235,3 +238,29 @@ def test_points_are_read_with_height_and_other_delimiters(tmp_path):
     np.testing.assert_array_equal(points.pixels[0], [20, 10])
     np.testing.assert_array_equal(points.places[0], [1, 2, 0.5])
     assert points.names == ("row 3", "row 4", "row 5", "row 7")
+
+
+def test_far_from_the_origin_a_camera_is_placed_as_near_it():
+    """Coordinates of UTM have millions of metres."""
+    near, _ = floor_points(GRID)
+    far = replace(near, places=near.places + FAR)
+    fits = [fit_place_robustly("here", LENS, points) for points in (near, far)]
+    np.testing.assert_allclose(fits[1].camera.place - FAR, fits[0].camera.place, atol=1e-5)
+    stds = [uncertainty(fit, None) for fit in fits]
+    assert stds[1].scale_std == pytest.approx(stds[0].scale_std, rel=1e-3)
+    np.testing.assert_allclose(stds[1].place_std_m, stds[0].place_std_m, rtol=1e-3)
+
+
+def test_points_and_cameras_may_have_coordinates_of_utm(tmp_path):
+    path = tmp_path / "points.csv"
+    points, _ = floor_points(GRID)
+    rows = np.c_[points.pixels, (points.places + FAR)[:, :2]]
+    np.savetxt(path, rows, "%.6f", ",", header="u,v,x,y", comments="")
+    read = read_points(path, SIZE)
+    np.testing.assert_allclose(read.places[:, :2], (points.places + FAR)[:, :2], atol=1e-5)
+    camera = fit_place("here", LENS, read).camera
+    camera.save(tmp_path / "camera.json")
+    assert OverheadCamera.load(tmp_path / "camera.json").place.tolist() == camera.place.tolist()
+    path.write_text("u,v,x,y\n1,2,3,2e8\n")
+    with pytest.raises(DataError, match=r"'2e8'; expected a number from -1e\+08 to 1e\+08 m"):
+        read_points(path, SIZE)
