@@ -13,6 +13,7 @@ from jaxtyping import Float
 from slipid.camera.csv_rows import csv_rows
 from slipid.camera.opencv import Grey, cv2
 from slipid.support.errors import DataError, bad_data
+from slipid.support.quantities import FrameRate, limits_of
 
 LOST_SHARE = 0.02
 """Largest fraction of a file's announced frames that may be missing without a message [1]; some
@@ -24,8 +25,6 @@ READ_AHEAD = 8
 """Number of frames that are decoded in advance."""
 LARGEST_TIME = 1e10
 """Largest size of a frame's time [s]; seconds since 1970 are below 2e9."""
-SLOWEST_FPS, FASTEST_FPS = 1e-5, 1e6
-"""Lowest and highest frame rate [1/s]."""
 Times = Float[np.ndarray, " frame"]
 """Times of frames [s]."""
 
@@ -142,11 +141,8 @@ def even_times(count: int, fps: float) -> Times:
     Raises:
         DataError: the rate is not a positive number, or far from that of any camera.
     """
-    if not SLOWEST_FPS <= fps <= FASTEST_FPS:
-        raise DataError(
-            f"--fps {fps:g}; expected a positive number of frames per second, from "
-            f"{SLOWEST_FPS:g} to {FASTEST_FPS:g}"
-        )
+    if not limits_of(FrameRate).holds(fps):
+        raise DataError(f"--fps {fps:g}; expected a number {limits_of(FrameRate)}")
     return np.arange(count) / fps
 
 

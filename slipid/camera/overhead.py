@@ -20,15 +20,14 @@ from slipid.camera.opencv import cv2, ideal_points
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_json
+from slipid.support.quantities import Bounds, Coordinate, Height
 from slipid.support.toml_file import Section, checked
 
 SCHEMA = "slipid.camera/1"
 Pixels = Annotated[int, Field(gt=0, le=100_000)]
-Within = Annotated[float, Field(ge=-1e6, le=1e6)]
-Row = Annotated[list[Within], Field(min_length=3, max_length=3)]
-Coefficient = Annotated[float, Field(ge=-1e4, le=1e4)]
-MOST_HEIGHT_M = 1e4
-"""Largest height of a camera above the floor [m]."""
+Entry = Annotated[float, Bounds(-1e6, 1e6)]
+Row = Annotated[list[Entry], Field(min_length=3, max_length=3)]
+Coefficient = Annotated[float, Bounds(-1e4, 1e4)]
 Three = Annotated[list[Row], Field(min_length=3, max_length=3)]
 
 
@@ -188,7 +187,7 @@ class CameraFile(Section):
     matrix: Three
     distortion: list[Coefficient] = Field(default_factory=list, max_length=14)
     rotation_from_world: Three | None = None
-    place_m: Row | None = None
+    place_m: tuple[Coordinate, Coordinate, Height] | None = None
     frame_s: Annotated[float, Field(gt=0, le=1e5)] | None = None
     scale_std: Annotated[float, Field(ge=0, le=1)] | None = None
     report: Content = Field(default_factory=dict)
@@ -216,11 +215,11 @@ class CameraFile(Section):
                 "rotation_from_world is not a rotation; expected an orthonormal matrix with "
                 "determinant 1"
             )
-        if not (0 < height <= MOST_HEIGHT_M and rotation[2, 2] < 0):
+        if not (height > 0 and rotation[2, 2] < 0):
             raise ValueError(
                 f"the camera is {height:g} m high and "
                 f"{'looks up' if rotation[2, 2] >= 0 else 'looks down'}; expected a camera above "
-                f"the floor (z up), {MOST_HEIGHT_M:g} m at most, that looks down"
+                "the floor (z up) that looks down"
             )
         return self
 

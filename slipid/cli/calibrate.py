@@ -9,6 +9,7 @@ from slipid.cli.common import Json, Next, Quiet, can_draw, emit, flag, guarded, 
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
+from slipid.support.quantities import CellLength, Degrees, Height, SquareEdge
 
 if TYPE_CHECKING:
     from slipid.camera.calibration.board import PrintedBoard
@@ -16,9 +17,6 @@ if TYPE_CHECKING:
     from slipid.camera.calibration.place import FloorFit
     from slipid.camera.calibration.quality import TooLittleCovered
     from slipid.report.page import Page
-
-MOST_M, MOST_DEG = 1e4, 3600.0
-"""Largest height above the floor [m] and size of an angle [deg]."""
 SIZE_STD = 0.001
 """Relative std of the lengths of a printed board or a measuring tape [1], by default."""
 
@@ -39,8 +37,12 @@ def calibrate(
         str | None,
         option("9x6", "Number of inner corners of a plain chessboard, instead of --board."),
     ] = None,
-    square: Annotated[float | None, option("M", "Edge length of a square, in m.", max=100)] = None,
-    marker: Annotated[float | None, option("M", "Edge length of a marker, in m.", max=100)] = None,
+    square: Annotated[
+        float | None, option("M", "Edge length of a square, in m.", kind=SquareEdge)
+    ] = None,
+    marker: Annotated[
+        float | None, option("M", "Edge length of a marker, in m.", kind=SquareEdge)
+    ] = None,
     dictionary: Annotated[
         str, option("NAME", "Name of the dictionary of the board's markers.")
     ] = "4X4_50",
@@ -59,7 +61,7 @@ def calibrate(
     ] = None,
     board_height: Annotated[
         float,
-        option("M", "Height of the board's printed face above the floor, in m.", min=-100, max=100),
+        option("M", "Height of the board's printed face above the floor, in m.", kind=Height),
     ] = 0.0,
     points: Annotated[
         Path | None,
@@ -76,19 +78,22 @@ def calibrate(
     ] = None,
     metres_per_pixel: Annotated[
         float | None,
-        option("M", "Length of a pixel on the floor, in m, if nothing was calibrated.", max=1),
+        option(
+            "M", "Length of a pixel on the floor, in m, if nothing was calibrated.", kind=CellLength
+        ),
     ] = None,
     lens_height: Annotated[
         float | None,
-        option("M", "Height of the lens above the floor, in m; with --metres-per-pixel.", max=1000),
+        option(
+            "M", "Height of the lens above the floor, in m; with --metres-per-pixel.", kind=Height
+        ),
     ] = None,
     turn: Annotated[
         float | None,
         option(
             "DEG",
             "Rotation of the world's axes, in deg; with --metres-per-pixel.",
-            min=-3600,
-            max=3600,
+            kind=Degrees,
         ),
     ] = None,
     json: Json = None,
@@ -150,10 +155,6 @@ def calibrate(
         if points is not None:
             fit = floor_from_points(lens, points, std)
         elif floor is not None and isinstance(seen, Board):
-            if not 0 <= board_height <= MOST_M:
-                raise DataError(
-                    f"--board-height {board_height:g}; expected a height in metres, 0 to {MOST_M:g}"
-                )
             fit = floor_from_board(lens, seen, floor, board_height, std)
         return _write(lens, fit, out, json, report)
 
@@ -179,11 +180,11 @@ def _refuse_combinations(
         )
 
 
-def _positive(option: str, value: float | None, most: float = 1.0) -> float:
-    """Return the value of an option; raise `DataError` if it is missing or not in 0 to `most`."""
-    if value is None or not 0 < value <= most:
+def _positive(option: str, value: float | None) -> float:
+    """Return the value of an option; raise `DataError` if it is missing or not positive."""
+    if value is None or not value > 0:
         problem = "is missing" if value is None else f"{value:g}"
-        raise DataError(f"{option} {problem}; expected a number above 0, {most:g} at most")
+        raise DataError(f"{option} {problem}; expected a number above 0")
     return value
 
 
@@ -242,9 +243,7 @@ def _uncalibrated(
     from slipid.camera.calibration.calibrate import straight_camera
 
     per_pixel = _positive("--metres-per-pixel", described[0])
-    height, turn = _positive("--lens-height", described[1], MOST_M), described[2] or 0.0
-    if not abs(turn) <= MOST_DEG:
-        raise DataError(f"--turn {turn:g}; expected an angle in degrees")
+    height, turn = _positive("--lens-height", described[1]), described[2] or 0.0
     camera = straight_camera(picture, per_pixel, height, turn, size_std)
     camera.save(out)
     content, following = camera.to_json(), _following(out)

@@ -14,6 +14,7 @@ import typer
 from typer.models import OptionInfo
 
 from slipid.support.errors import DataError
+from slipid.support.quantities import limits_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -28,6 +29,7 @@ def option(
     *names: str,
     min: float | int | None = None,
     max: float | int | None = None,
+    kind: object = None,
 ) -> OptionInfo:
     """Return an option with a value, for an annotation.
 
@@ -36,7 +38,10 @@ def option(
         words: meaning of the option.
         names: name of the option; by default it is made from the name of the function's parameter.
         min, max: limits of a numeric value.
+        kind: kind of number in `slipid.support.quantities`, whose bounds are the limits.
     """
+    if kind is not None:
+        min, max = limits_of(kind).low, limits_of(kind).high
     made: OptionInfo = typer.Option(*names, metavar=metavar, help=words, min=min, max=max)
     return made
 

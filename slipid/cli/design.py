@@ -47,7 +47,9 @@ def design(
     ] = None,
     distance: Annotated[
         float | None,
-        option("M", "Length of a run in m; by default that of the logged runs.", max=10_000),
+        option(
+            "M", "Length of a run in m; by default that of the logged runs.", min=1e-3, max=10_000
+        ),
     ] = None,
     floor: Annotated[
         list[str] | None,

@@ -9,6 +9,7 @@ from slipid.cli.common import Json, Next, Out, Quiet, can_draw, emit, guarded, o
 from slipid.support.errors import DataError
 from slipid.support.folder import locked
 from slipid.support.progress import Reporter
+from slipid.support.quantities import Height
 
 if TYPE_CHECKING:
     from slipid.camera.floor.result import PictureMap
@@ -42,7 +43,7 @@ def map_(
         float, option("M", "Radius of the masked disc around the robot, in m.", min=0, max=10)
     ] = 0.2,
     marker_height: Annotated[
-        float, option("M", "Height of the marker above the floor, in m.", min=0, max=10)
+        float, option("M", "Height of the marker above the floor, in m.", kind=Height)
     ] = 0.25,
     json: Json = None,
     quiet: Quiet = False,

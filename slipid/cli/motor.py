@@ -10,6 +10,7 @@ from slipid.cli.common import Json, MaybeOut, Quiet, can_draw, emit, flag, guard
 from slipid.cli.identify import PRIORS
 from slipid.support.folder import locked
 from slipid.support.progress import Reporter
+from slipid.support.quantities import GearRatio, PolePairs, TicksPerTurn
 
 Column = str | None
 _column = partial(option, "[FILE::]NAME[:UNIT]")
@@ -38,12 +39,14 @@ def motor(
     pole_pairs: Annotated[
         float | None,
         option(
-            "NUMBER", "Pole pairs of the motor, if the speed is electrical (erpm).", min=1, max=1000
+            "NUMBER", "Pole pairs of the motor, if the speed is electrical (erpm).", kind=PolePairs
         ),
     ] = None,
     gear: Annotated[
         float,
-        option("RATIO", "Motor turns per turn of the sensor of speed, angle or pulses.", max=1e5),
+        option(
+            "RATIO", "Motor turns per turn of the sensor of speed, angle or pulses.", kind=GearRatio
+        ),
     ] = 1.0,
     pulses: Annotated[
         Column,
@@ -51,7 +54,7 @@ def motor(
     ] = None,
     pulses_per_revolution: Annotated[
         float | None,
-        option("NUMBER", "Pulses per turn of the tachometer; with --pulses.", max=1e6),
+        option("NUMBER", "Pulses per turn of the tachometer; with --pulses.", kind=TicksPerTurn),
     ] = None,
     ignore: Annotated[
         list[str] | None, option("NAME", "Column that is not guessed to be a channel; repeatable.")

@@ -9,6 +9,7 @@ import typer
 from slipid.cli.common import Json, Next, Quiet, emit, guarded, option
 from slipid.support.folder import locked
 from slipid.support.progress import Reporter
+from slipid.support.quantities import Degrees, FrameRate, Height, MarkerEdge, Seconds
 
 if TYPE_CHECKING:
     from slipid.camera.tracking.detector import Region
@@ -26,18 +27,18 @@ def track(
     camera: Annotated[Path, option("FILE", "Camera file of `slipid calibrate`.")],
     out: Annotated[Path, option("FILE", "File of poses to write (.csv or .parquet).")],
     marker_size: Annotated[
-        float | None, option("M", "Edge length of the marker's black square, in m.", max=1e6)
+        float | None,
+        option("M", "Edge length of the marker's black square, in m.", kind=MarkerEdge),
     ] = None,
     marker_height: Annotated[
-        float | None, option("M", "Height of the marker above the floor, in m.", min=-1e6, max=1e6)
+        float | None, option("M", "Height of the marker above the floor, in m.", kind=Height)
     ] = None,
     marker_yaw: Annotated[
         float,
         option(
             "DEG",
             "Direction of the marker's top edge, in deg counter-clockwise from the robot's x axis.",
-            min=-3600,
-            max=3600,
+            kind=Degrees,
         ),
     ] = 0.0,
     dictionary: Annotated[str, option("NAME", "Name of the dictionary of the marker.")] = "4X4_50",
@@ -57,7 +58,9 @@ def track(
     ] = None,
     fps: Annotated[
         float | None,
-        option("HZ", "Frame rate, in Hz; by default the times in the video are used.", max=1e6),
+        option(
+            "HZ", "Frame rate, in Hz; by default the times in the video are used.", kind=FrameRate
+        ),
     ] = None,
     times: Annotated[
         Path | None, option("FILE", "CSV file of the frame times, with columns frame and time [s].")
@@ -67,7 +70,7 @@ def track(
     ] = None,
     seconds: Annotated[
         float | None,
-        option("S", "Duration of the recording in s; required for a camera device.", max=1e6),
+        option("S", "Duration of the recording in s; required for a camera device.", kind=Seconds),
     ] = None,
     preview: Annotated[
         Path | None, option("FILE", "Picture to write, with the poses of one frame drawn in it.")

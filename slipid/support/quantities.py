@@ -4,13 +4,15 @@ The bounds hold every robot, from a toy of 1 cm to a mining truck, with decades 
 beyond them is a typing error or has a different unit, and would overflow in later computations.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args
-
-from pydantic import AfterValidator, Field, GetCoreSchemaHandler
-from pydantic_core import CoreSchema, core_schema
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from slipid.support.errors import shown
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core import CoreSchema
 
 LONGEST_PATH = 300
 """Largest number of characters of a path or glob in a config."""
@@ -35,9 +37,12 @@ class Bounds:
     of_size: bool = False
 
     def __get_pydantic_core_schema__(
-        self, source: type, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
+        self, source: type, handler: "GetCoreSchemaHandler"
+    ) -> "CoreSchema":
         """Return the schema by which pydantic checks such a number."""
+        # options of the command line have bounds, too, and their help has no need of pydantic
+        from pydantic_core import core_schema
+
         kind = int if source is int else float
         return core_schema.no_info_before_validator_function(
             lambda value: self.checked(value, kind), handler(source)
@@ -69,18 +74,30 @@ def bounds_of(kind: object) -> Bounds | None:
     return next(filter(None, map(bounds_of, get_args(kind))), None)
 
 
+def limits_of(kind: object) -> Bounds:
+    """Return the bounds of a kind of number; raise `TypeError` if it has none."""
+    bounds = bounds_of(kind)
+    if bounds is None:
+        raise TypeError(f"{kind} has no bounds")
+    return bounds
+
+
 Number = Annotated[float, Bounds(-1e12, 1e12)]
 """Number of any sign, such as the value of a parameter in SI units."""
 Positive = Annotated[float, Bounds(1e-12, 1e12)]
 """Positive number, such as a standard deviation or the inertia of a rotor."""
 NotNegative = Annotated[float, Bounds(0, 1e12)]
 """Positive number, or 0."""
-Part = Annotated[float, Field(ge=0, lt=1, strict=True)]
-"""Fraction of a whole, at least 0 and below 1 [1]."""
 Length = Annotated[float, Bounds(1e-4, 1e3, "m")]
 """Length of a part of a robot [m]."""
 Coordinate = Annotated[float, Bounds(-1e8, 1e8, "m")]
 """Coordinate of a place on a floor, such as an easting of UTM [m]."""
+Height = Annotated[float, Bounds(0, 1e4, "m")]
+"""Height of a camera or a marker above the floor [m]."""
+MarkerEdge = Annotated[float, Bounds(1e-4, 10, "m")]
+"""Edge length of a marker [m]."""
+SquareEdge = Annotated[float, Bounds(1e-4, 1, "m")]
+"""Edge length of a square or a marker of a printed board [m]."""
 CellLength = Annotated[float, Bounds(1e-5, 1, "m")]
 """Edge length of a cell of a map, or of a pixel on a floor [m]."""
 Degrees = Annotated[float, Bounds(-3600, 3600, "deg")]
@@ -91,8 +108,12 @@ Speed = Annotated[float, Bounds(1e-4, 100, "m/s")]
 """Speed of a robot [m/s]."""
 Seconds = Annotated[float, Bounds(1e-6, 1e6, "s")]
 """Duration [s]."""
+FrameRate = Annotated[float, Bounds(1e-5, 1e6, "frames per second")]
+"""Frame rate of a video or a camera [1/s]."""
 GearRatio = Annotated[float, Bounds(1e-3, 1e5)]
 """Turns of the motor per turn of the wheel [1]."""
+PolePairs = Annotated[float, Bounds(1, 1000)]
+"""Pole pairs of a motor, electrical turns per turn of its shaft [1]."""
 TicksPerTurn = Annotated[float, Bounds(0.1, 1e9)]
 """Ticks of an encoder per turn [1]."""
 Scale = Annotated[float, Bounds(1e-18, 1e18, of_size=True)]
@@ -101,6 +122,21 @@ Offset = Annotated[float, Bounds(-1e20, 1e20)]
 """Number that is added to those of a column, such as nanoseconds since 1970."""
 Seed = Annotated[int, Bounds(0, 2**63 - 1)]
 """Seed of random numbers."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Check of a text, as metadata of its type; `check` returns the text or raises `ValueError`."""
+
+    check: Callable[[str], str]
+
+    def __get_pydantic_core_schema__(
+        self, source: type, handler: "GetCoreSchemaHandler"
+    ) -> "CoreSchema":
+        """Return the schema by which pydantic checks such a text."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
 
 
 LONGEST_LABEL = 100
@@ -140,9 +176,9 @@ def label(text: str) -> str:
     return text
 
 
-Label = Annotated[str, AfterValidator(label)]
+Label = Annotated[str, Checked(label)]
 """Name of a floor, load set-up, session or layout."""
-PathText = Annotated[str, AfterValidator(path_text)]
+PathText = Annotated[str, Checked(path_text)]
 """Path of a file, relative or absolute."""
-InsidePath = Annotated[str, AfterValidator(inside)]
+InsidePath = Annotated[str, Checked(inside)]
 """Path of a file inside a folder, relative to it."""

@@ -28,7 +28,7 @@ def shown(capsys, out=None, written=(), to=None, following=(NEXT,), show=lambda 
     return capsys.readouterr().out
 
 
-def test_every_number_of_the_command_line_has_a_largest_value():
+def test_every_number_of_the_command_line_has_limits():
     count = 0
     for name, command in GROUP.commands.items():
         hints = get_type_hints(inspect.unwrap(command.callback), include_extras=True)
@@ -36,6 +36,8 @@ def test_every_number_of_the_command_line_has_a_largest_value():
             kind, *info = get_args(hint) or (hint,)
             if {float, int} & {kind, *get_args(kind)} and option != "return":
                 assert 1 <= info[0].max <= 2**32, (name, option)
+                assert info[0].min is not None, (name, option)
+                assert -3600 <= info[0].min < info[0].max, (name, option)
                 count += 1
     assert count > 25
 

@@ -317,7 +317,7 @@ def test_speeds_in_turns_are_known_by_the_names_of_sysid(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--gear", "0"), "--gear: 0; expected a number above 1e-6"),
+        (("--gear", "0"), "'--gear'"),
         (("--ignore", "J", "--ignore", "w"), "no column 'J' to ignore"),
         (("--ignore", "I", "--ignore", "U"), "no column for the current or voltage"),
         (("--pulses", "w"), "only one of --pulses and --pulses-per-revolution"),

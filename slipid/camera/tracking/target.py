@@ -36,11 +36,10 @@ from pydantic import Field
 
 from slipid.camera.opencv import marker_count
 from slipid.support.errors import DataError
+from slipid.support.quantities import Bounds, Degrees, Height, MarkerEdge
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
-MOST_SIZE_M, MOST_HEIGHT_M = 10.0, 1000.0
-"""Largest edge length of a marker, and its largest height above the floor [m]."""
-Aside = Annotated[float, Field(ge=-100, le=100)]
+Aside = Annotated[float, Bounds(-100, 100, "m")]
 Id = Annotated[int, Field(ge=0, strict=True)]
 
 
@@ -119,10 +118,10 @@ class Target:
 class _Placed(Section):
     """Size, position and direction of a marker or a board on the body."""
 
-    size_m: Annotated[float, Field(gt=0, le=MOST_SIZE_M, strict=True)]
-    height_m: Annotated[float, Field(ge=0, le=MOST_HEIGHT_M)]
+    size_m: MarkerEdge
+    height_m: Height
     place_m: tuple[Aside, Aside] = (0.0, 0.0)
-    yaw_deg: Annotated[float, Field(ge=-3600, le=3600)] = 0.0
+    yaw_deg: Degrees = 0.0
 
 
 class _Single(_Placed):
@@ -137,7 +136,7 @@ class _Board(_Placed):
     first_id: Id
     columns: Annotated[int, Field(ge=1, le=100)]
     rows: Annotated[int, Field(ge=1, le=100)]
-    gap_m: Annotated[float, Field(gt=0, le=MOST_SIZE_M, strict=True)]
+    gap_m: MarkerEdge
 
     def markers(self) -> list[Marker]:
         """Return the board's markers row by row, beginning ahead on the left."""

@@ -18,12 +18,13 @@ from slipid.camera.tracking.outputs import (
     write_poses,
     write_preview,
 )
-from slipid.camera.tracking.target import MOST_HEIGHT_M, MOST_SIZE_M, Marker, Target
+from slipid.camera.tracking.target import Marker, Target
 from slipid.camera.tracking.track import Flag, TrackedPoses, track_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
+from slipid.support.quantities import Degrees, Height, MarkerEdge, limits_of
 
 SCHEMA = "slipid.track/1"
 
@@ -174,18 +175,13 @@ class LoneMarker:
     yaw: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.size <= MOST_SIZE_M:
-            raise DataError(
-                f"--marker-size {self.size:g}; expected the edge length of the black square in "
-                f"metres, {MOST_SIZE_M:g} at most"
-            )
-        if not 0 <= self.height <= MOST_HEIGHT_M:
-            raise DataError(
-                f"--marker-height {self.height:g}; expected the height above the floor in metres, "
-                f"{MOST_HEIGHT_M:g} at most"
-            )
-        if not abs(self.yaw) <= 20 * np.pi:
-            raise DataError(f"--marker-yaw {np.degrees(self.yaw):g}; expected an angle in degrees")
+        for option, value, kind in (
+            ("--marker-size", self.size, MarkerEdge),
+            ("--marker-height", self.height, Height),
+            ("--marker-yaw", float(np.degrees(self.yaw)), Degrees),
+        ):
+            if not limits_of(kind).holds(value):
+                raise DataError(f"{option} {value:g}; expected a number {limits_of(kind)}")
         most = marker_count(self.dictionary) - 1
         if self.id is not None and self.id > most:
             raise DataError(f"--id {self.id}; expected 0 to {most} in {self.dictionary}")

@@ -18,6 +18,7 @@ from slipid.data.reading.motor_tools import tool_meanings
 from slipid.data.reading.table_format import TableFormat
 from slipid.data.reading.units import converts
 from slipid.support.errors import DataError, bad_data, did_you_mean
+from slipid.support.quantities import GearRatio, PolePairs, TicksPerTurn, limits_of
 
 SHAFT_GEAR_RATIO = 10.0
 """Fictitious gear ratio of the layout, with which the checks allow a motor shaft to turn ten times
@@ -72,13 +73,13 @@ class MotorOptions:
     ignored: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        for option, value in (
-            ("--pole-pairs", self.pole_pairs),
-            ("--gear", self.gear_ratio),
-            ("--pulses-per-revolution", self.pulses_per_revolution),
+        for option, value, kind in (
+            ("--pole-pairs", self.pole_pairs, PolePairs),
+            ("--gear", self.gear_ratio, GearRatio),
+            ("--pulses-per-revolution", self.pulses_per_revolution, TicksPerTurn),
         ):
-            if value is not None and not 1e-6 < value < 1e6:
-                raise DataError(f"{option}: {value:g}; expected a number above 1e-6 and below 1e6")
+            if value is not None and not limits_of(kind).holds(value):
+                raise DataError(f"{option}: {value:g}; expected a number {limits_of(kind)}")
 
 
 def given_columns(text: str, channel: str) -> GivenColumns:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +15,7 @@ from slipid.lab.testsite.omni_build import OmniBuild
 from slipid.lab.testsite.ordinary_build import OrdinaryBuild
 from slipid.lab.testsite.surfaces import SURFACES, SurfacePhysics
 from slipid.support.content import Content
-from slipid.support.quantities import Bounds, Coordinate, Part, Seconds
+from slipid.support.quantities import Bounds, Coordinate, Seconds
 from slipid.support.toml_file import CLOSED
 
 Interval = Annotated[float, Bounds(1e-3, 1, "s")]
@@ -23,6 +24,8 @@ Tilt = Annotated[float, Bounds(-10, 10, "deg")]
 """Tilt of the camera about one axis [deg]."""
 Pixels = Annotated[int, Bounds(16, 10_000)]
 """Width or height of an image [pixel]."""
+Part = Annotated[float, Field(ge=0, lt=1, strict=True)]
+"""Fraction of a whole, at least 0 and below 1 [1]."""
 Distortion = Annotated[float, Bounds(-10, 10)]
 """Coefficient of OpenCV's lens model [1]."""
 

@@ -140,7 +140,10 @@ def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
         (("--camera", "c.json", "--floor", "floor.png", "--points", "p.csv"), "one of them"),
         (("--camera", "c.json", "--points", "absent.csv"), "absent.csv: No such file"),
         (("floor.png", "--metres-per-pixel", "0.004"), "--lens-height is missing"),
-        (("floor.png", "--metres-per-pixel", "-1", "--lens-height", "2"), "-1; expected a number"),
+        (
+            ("floor.png", "--metres-per-pixel", "-1", "--lens-height", "2"),
+            "'--metres-per-pixel'",
+        ),
         (("floor.png", "--turn", "9", *WORDS), "a camera without calibration"),
     ],
 )

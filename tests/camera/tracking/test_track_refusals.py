@@ -90,17 +90,22 @@ def test_region_decides_between_several(made, tmp_path):
 
 
 SIZES = {
-    "--marker-size 0": ("--marker-size", 0, "--marker-height", 0.25),
+    "--marker-size": (
+        "--marker-size",
+        0,
+        "--marker-height",
+        0.25,
+    ),
     "--marker-size nan": ("--marker-size", "nan", "--marker-height", 0.25),
     "--marker-height inf": ("--marker-size", 0.131, "--marker-height", "inf"),
-    "10 at most": ("--marker-size", 131, "--marker-height", 0.25),
-    "1000 at most": ("--marker-size", 0.131, "--marker-height", 131_000),
+    "'--marker-size'": ("--marker-size", 131, "--marker-height", 0.25),
+    "'--marker-height'": ("--marker-size", 0.131, "--marker-height", 131_000),
     "--marker-yaw nan": (*LONE, "--marker-yaw", "nan"),
     "--id 50; expected 0 to 49": (*LONE, "--id", 50),
     "below the camera": ("--marker-size", 0.131, "--marker-height", 1.7),
     "expected --marker-size and": ("--marker-size", 0.131),
     "no marker dictionary '4X4_5'": (*LONE, "--dictionary", "4X4_5"),
-    "expected a positive number of frames per second": (*LONE, "--fps", 0),
+    "'--fps'": (*LONE, "--fps", 0),
     "--seconds is for devices": (*LONE, "--seconds", 3),
     "no frame 99; expected 0 to 19": (*LONE, "--preview", "look.png", "--preview-frame", 99),
 }
