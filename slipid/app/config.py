@@ -404,7 +404,7 @@ class FitSection(Section):
     windows_per_piece: Annotated[int, Bounds(1, 32)] = 4
     longest_window_s: Seconds | None = None
     rounds: Annotated[int, Bounds(1, 10_000)] = 30
-    tolerance: Annotated[float, Bounds(1e-6, 10)] = 0.02
+    tolerance: Annotated[float, Bounds(1e-15, 10)] = 0.02
     intervals: Literal["sampled", "laplace"] = "sampled"
     seed: Seed = 0
 
