@@ -34,7 +34,7 @@ from slipid.search_space import Choice, Space, with_values
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, json_text, read_bytes, read_json, write_together
-from slipid.support.parsing import arrays_of
+from slipid.support.parsing import MOST_ARRAY_BYTES, arrays_of
 
 _RESULT = "the result of `slipid identify`"
 SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/9"
@@ -121,7 +121,7 @@ def _packed(fit: Fit) -> bytes:
 def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
     """Return the arrays of a fit, after a check of the file's hash."""
     path = folder / file
-    packed = read_bytes(path, f"the arrays of {FIT}")
+    packed = read_bytes(path, f"the arrays of {FIT}", MOST_ARRAY_BYTES)
     if hashlib.sha256(packed).hexdigest() != sha256:
         raise DataError(f"{path}: damaged, its hash differs from the one in {FIT}; {AGAIN}")
     try:
