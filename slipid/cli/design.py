@@ -1,5 +1,6 @@
 """`slipid design`: propose the next runs to drive."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -71,6 +72,7 @@ def design(
     from slipid.infer.design import proposal
     from slipid.infer.design.scope import Scope
     from slipid.infer.fit_file import load as load_fit
+    from slipid.infer.result_folder import fit_of
     from slipid.report.answers import show_design
     from slipid.support.jax_setup import setup_jax
 
@@ -81,6 +83,7 @@ def design(
         report.stage("simulating candidate runs", usual_s=SIMULATING_S)
         scope = Scope(fit, *goals, runs, headings, speeds, turns, distance, *places)
         found = proposal.design(scope)
+        found = replace(found, content={**found.content, "fit": fit_of(out)})
         written = write(found, out, report)
     words = ("identify", out / "config.toml", "--data", "logs", "--out", f"{out}_again")
     step = Next("after driving them, with the old and the new logs in a folder logs", words)
@@ -94,10 +97,9 @@ def write(found: "Design", out: Path, report: Reporter) -> list[str]:
     If the design proposes no runs, the files of an earlier design are removed.
     """
     from slipid.infer.design.proposal import commands
-    from slipid.infer.result_folder import fit_of
     from slipid.support.files import write_bytes, write_json
 
-    write_json(out / "design.json", {**found.content, "fit": fit_of(out)})
+    write_json(out / "design.json", found.content)
     table, picture = out / "design_commands.csv", out / "design.png"
     if not found.runs:
         for old in (table, picture):
