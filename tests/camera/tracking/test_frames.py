@@ -248,7 +248,7 @@ def test_files_that_are_no_times(tmp_path):
     with pytest.raises(DataError, match="expected times of frames"):
         read_times(tmp_path)
     for fps in (0.0, -1.0, 1e308, 1e-308, float("nan"), float("inf")):
-        with pytest.raises(DataError, match="expected a positive number of frames per second"):
+        with pytest.raises(DataError, match="expected a number from 1e-05"):
             even_times(3, fps)
 
 
