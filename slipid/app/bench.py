@@ -285,10 +285,8 @@ def identify_bench(
     fit = task.fit(report)
     writable(out)
     content = bench_content(fit)
-    files = {IDENTIFIED: json_text(content), CONFIG: config.text}
-    write_together(
-        {out / k: v.encode() for k, v in files.items()}, files_of_fit(out, keep_config=True)
-    )
+    files = {out / IDENTIFIED: json_text(content).encode(), out / CONFIG: config.text.encode()}
+    write_together(files, files_of_fit(out, keep_config=True))
     gains = write_gains(out, bench_feedforwards(fit))
 
     inputs: Content = {

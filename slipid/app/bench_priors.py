@@ -14,7 +14,7 @@ from slipid.search_space import Choice
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json
-from slipid.support.quantities import Bounds
+from slipid.support.quantities import Number, limits_of
 
 SCHEMA = "slipid.identified/1"
 COPY_NAME = "motor_bench.json"
@@ -32,7 +32,7 @@ WEAK_STD = 0.1
 """Least std of the logarithm of a weak number: a misfit may be larger than its interval [1]."""
 KNOWN = ("identified", "weak")
 """Verdicts with which a parameter is taken from a bench."""
-_SIZE = Bounds(-1e12, 1e12)
+_SIZE = limits_of(Number)
 _EXPECTED = "the identified.json that `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 

@@ -257,10 +257,8 @@ def calibrate_only(
     }
     content = json.loads(json_text(content))
     content |= {"fit": checksum(content)}
-    files = {IDENTIFIED: json_text(content), CONFIG: task.config.text}
-    write_together(
-        {out / k: v.encode() for k, v in files.items()}, files_of_fit(out, keep_config=True)
-    )
+    files = {out / IDENTIFIED: json_text(content).encode(), out / CONFIG: task.config.text.encode()}
+    write_together(files, files_of_fit(out, content["fit"], keep_config=True))
     write_run(task, found.trust, data, out, time.monotonic() - began)
     return replace(found, written=(IDENTIFIED, "run.json", "config.toml"))
 

@@ -46,9 +46,9 @@ NEAR_OPTIMUM = 3
 """Round number given to a start near the optimum, so that the fit does not repeat its first rounds,
 which take more steps."""
 CHECKPOINT = "checkpoint"
-LATER = ("posterior.nc", "validation.json", "trial.json", "design.json")
-"""Names of files that later commands make from a fit, which take long to make again."""
 """Name, without suffix, of the file with the state of an unfinished fit."""
+FOLLOWING = ("posterior.nc", "validation.json", "trial.json", "design.json")
+"""Names of files that later commands make from a fit, which take long to make again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +167,7 @@ def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
         before = read_run_file(out)
     except DataError:
         return None
-    later = ", ".join(name for name in LATER if (out / name).exists())
+    later = ", ".join(name for name in FOLLOWING if (out / name).exists())
     same = before.config.sha256 == task.config.hash
     if same and before.data.hash == task.data_hash:
         stays = f"{out} has {later} of an earlier fit: deleted unless the new fit is the same"

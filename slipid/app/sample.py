@@ -44,8 +44,7 @@ def sample(
 
     The draws are written to `out` as posterior.nc, and the content as sample.json. The files
     identified.json and robot.json are replaced; they then have the intervals and draws of the
-    posterior. An interrupted chain
-    resumes where it stopped.
+    posterior. An interrupted chain resumes where it stopped.
 
     Args:
         out: folder that `slipid identify` wrote.

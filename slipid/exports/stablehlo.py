@@ -198,11 +198,11 @@ def _start_and_steps(
 
     rows = len(np.atleast_1d(arrays.get("given", 0)))
     fields = signature.said[:-1], signature.said[-1:]
-    said, command = (sum(field.size for field in some) for some in fields)
+    estimate, command = (sum(field.size for field in some) for some in fields)
     given = sum(field.size for field in signature.given)
     state = enumerate(signature.state)
     start = tuple(jnp.asarray(array(f"start{k}", field.shape)) for k, field in state)
-    names = {"given": given, "said": said, "command": command}
+    names = {"given": given, "said": estimate, "command": command}
     return start, Golden(**{name: array(name, (rows, n)) for name, n in names.items()})
 
 

@@ -17,7 +17,7 @@ from slipid.support.folder import temporary_of
 from slipid.support.parsing import MOST_ARRAY_BYTES, arrays_of, json_of
 
 PIPE = "a pipe or a device; save it to a file first"
-"""What is wrong with a path of no regular file, such as `<(command)` of a shell, in messages."""
+"""Words of messages for a path of no regular file, such as `<(command)` of a shell."""
 
 
 def write_bytes(path: Path, data: bytes) -> None:

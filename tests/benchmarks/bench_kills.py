@@ -146,7 +146,7 @@ def difference(one: Path, other: Path, result: tuple[str, ...], close: float) ->
 
 
 def refuse_mixture(out: Path) -> str:
-    """What a folder is after a kill: of one fit, or refused with a message."""
+    """Return `one fit` or `no fit`, or the message by which a folder is refused after a kill."""
     try:
         fit_of(out)
         if (out / "fit.json").exists():

@@ -348,9 +348,9 @@ def test_a_cut_keeps_what_motion_alone_says_of_the_motion():
 
 @pytest.mark.slow
 def test_no_bit_of_a_step_depends_on_runs_that_are_left_out(truth):
-    """Of the motion, the currents, the voltages, what runs share, and the variances.
+    """A step contains motion, currents, voltages, shared effects and variances.
 
-    Wheels of the replaced runs turn backwards, so that no run has another speed.
+    Wheels of the replaced runs turn backwards, so that every run keeps its speed.
     """
     w = made(truth, std=NOISE)
     keep = np.ones(24)

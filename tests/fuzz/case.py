@@ -48,7 +48,7 @@ _CHANGES = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a case.
+    """Result of a case.
 
     Attributes:
         verdict: `accepted`, `refused`, or a failure: `traceback`, `hang`, `memory`, `silent`,
@@ -75,7 +75,7 @@ class Verdict:
 
     @property
     def signature(self) -> str:
-        """What cases with the same cause have in common."""
+        """Text that cases with the same cause have in common."""
         return f"{self.verdict} {self.kind} {self.place}"
 
 

@@ -110,18 +110,18 @@ def test_a_folder_that_is_read_only_is_refused_before_the_work(small_disk):
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
     with pytest.raises(DataError, match=r"cannot be written \(Read-only file system\)"):
         writable(small_disk)
-    said = invoke("check", "none.toml", "--data", ".", "--out", small_disk)
-    assert said.exit_code == 2
+    ended = invoke("check", "none.toml", "--data", ".", "--out", small_disk)
+    assert ended.exit_code == 2
 
 
 @pytest.mark.parametrize("name", ["*", "a?.json", "n" * 300, "", "a\nb", "/dev/full", "."])
 def test_names_that_no_json_can_have_are_refused_before_the_work(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    said = invoke("check", "none.toml", "--data", ".", "--json", name)
-    assert said.exit_code == 2
-    assert said.stderr.startswith("--json ")
-    assert len(said.stderr) < 500
-    assert said.stderr.count("\n") == 1
+    ended = invoke("check", "none.toml", "--data", ".", "--json", name)
+    assert ended.exit_code == 2
+    assert ended.stderr.startswith("--json ")
+    assert len(ended.stderr) < 500
+    assert ended.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 

@@ -104,4 +104,5 @@ def test_where_locks_are_not_supported_work_goes_on(tmp_path, monkeypatch):
 
     monkeypatch.setattr(fcntl, "flock", unsupported)
     with locked(tmp_path, "identify"), locked(tmp_path, "sample"):
-        pass
+        (tmp_path / "result").touch()
+    assert [p.name for p in tmp_path.iterdir()] == ["result"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import get_type_hints
 
 from slipid.app.config import LimitsSection, Place
-from slipid.support.quantities import Degrees, TicksPerTurn, bounds_of
+from slipid.support.quantities import Degrees, TicksPerTurn, limits_of
 
 RobotOptions = Mapping[str, str]
 """Values of the command-line options that describe a robot, keyed by attribute of `RobotAnswers`.
@@ -73,8 +73,7 @@ def number(text: str, kind: object) -> float:
     except ValueError:
         comma = " with a decimal point" if "," in text else ""
         raise ValueError(f"expected a number{comma}") from None
-    bounds = bounds_of(kind)
-    assert bounds is not None
+    bounds = limits_of(kind)
     if not bounds.holds(value):
         raise ValueError(f"expected a number {bounds}")
     return value
