@@ -56,7 +56,7 @@ class Bounds:
 
     def holds(self, value: float | int) -> bool:
         """Return True if a number is within the bounds; NaN is not."""
-        return self.low <= (abs(value) if self.of_size else value) <= self.high
+        return bool(self.low <= (abs(value) if self.of_size else value) <= self.high)
 
     def checked(self, value: Any, kind: type[int] | type[float] = float) -> float | int:
         """Return a number within the bounds; raise `ValueError` for anything else."""
