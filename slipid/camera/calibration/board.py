@@ -21,6 +21,10 @@ equations, so three corners would leave no equation for the lens."""
 REFINED_SHARE = 0.4
 """Half the width of the window in which a corner of a plain chessboard is refined, relative to the
 smallest distance between neighbouring corners [1]; a wider one would contain other corners."""
+IRREGULAR = 0.5
+"""Change of the step between corners from one step to the next, relative to the larger one [1],
+above which corners are none of a chessboard: no perspective or lens bends a grid so much. In
+real pictures of chessboards it was 0.13 at most."""
 Corners = tuple[Float[np.ndarray, "corner 2"], Float[np.ndarray, "corner 2"]]
 """Pixels of detected corners, and their positions in the board's axes [m]."""
 
@@ -178,11 +182,27 @@ class Chessboard(PrintedBoard):
         scale = np.array(size_of(grey)) / size_of(copy)
         pixels = ((np.asarray(rough, float).reshape(-1, 2) + 0.5) * scale - 0.5).astype(np.float32)
         grid = pixels.reshape(*shape[::-1], 2)
+        if not _regular(grid):
+            return np.zeros((0, 2)), np.zeros((0, 2))
         steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
         reach = max(2, int(REFINED_SHARE * min(steps)))
         until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
         fine = cv2.cornerSubPix(grey, pixels.reshape(-1, 1, 2), (reach, reach), (-1, -1), until)
         return np.asarray(fine, float).reshape(-1, 2), self.corners_m
+
+
+def _regular(grid: Float[np.ndarray, "row column 2"]) -> bool:
+    """Return True if the steps of a grid of corners change little from each to the next.
+
+    OpenCV also returns grids of what is no chessboard, such as the keys of a keyboard.
+    """
+    for axis, across in ((0, 0), (0, 1), (1, 1)):
+        steps = np.moveaxis(np.diff(grid, axis=axis), across, 0)
+        before, after = steps[:-1], steps[1:]
+        larger = np.maximum(*(np.linalg.norm(one, axis=-1) for one in (before, after)))
+        if (np.linalg.norm(after - before, axis=-1) > IRREGULAR * larger).any():
+            return False
+    return True
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,6 +83,19 @@ def test_wrong_words_for_a_chessboard_are_named(plain, tmp_path, monkeypatch, wo
     assert not out.exists()
 
 
+def test_a_grid_of_irregular_steps_is_no_chessboard(plain, monkeypatch):
+    picture = Picture(plain / "view04.png", cv2.imread(str(plain / "view04.png")))
+    board, usual = Chessboard(7, 5, 0.04), cv2.findChessboardCornersSB
+    assert len(view_of(board, picture).pixels) == 24
+
+    def with_one_moved(*args, **named):
+        found, corners = usual(*args, **named)
+        return found, corners + 25 * (np.arange(corners.size) == 16).reshape(corners.shape)
+
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", with_one_moved)
+    assert not len(view_of(board, picture).pixels)
+
+
 def test_a_board_with_markers_is_no_plain_chessboard(folder):
     picture = Picture(folder / "lens" / "view04.png", cv2.imread(str(folder / "lens/view04.png")))
     with pytest.raises(DataError, match=r"found 17 markers of 4X4_50: a board with markers needs"):
