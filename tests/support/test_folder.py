@@ -19,7 +19,9 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no 
 def holder(folder: Path) -> subprocess.Popen:
     """A process that has the lock of a folder until it is ended."""
     code = (
-        "import sys, time; from pathlib import Path; from slipid.support.folder import locked\n"
+        "import signal, sys, time; from pathlib import Path\n"
+        "from slipid.support.folder import locked\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background\n"
         "with locked(Path(sys.argv[1]), 'sample'):\n"
         "    print('locked', flush=True)\n"
         "    time.sleep(600)\n"
