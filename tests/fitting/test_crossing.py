@@ -26,6 +26,7 @@ from slipid.data.windows import Windows
 from slipid.deploy.deploy import read_robot
 from slipid.fitting import likelihood as lk
 from slipid.fitting import multi_floor as cut
+from slipid.fitting import optimise as optimising
 from slipid.fitting.multi_floor_fit import (
     _every_second_sector,
     fit_multi_floor,
@@ -214,6 +215,28 @@ def test_held_out_runs_over_several_floors_change_no_step_of_the_motion(fitted):
     )
     off = (other.state.z - one.state.z) / np.sqrt(np.diag(one.covariance))
     assert np.abs(off).max() < 0.01
+
+
+def test_a_round_gives_its_solver_the_derivative_of_its_residuals(fitted, monkeypatch):
+    true, problem, optimum = fitted
+    whole = problem.with_multi_floor(crossed(true, 6, 5))
+    given = []
+
+    def noted(residuals, size, near, steps):
+        given.append((residuals, near))
+        return np.zeros(size), near
+
+    monkeypatch.setattr(optimising, "levenberg", noted)
+    start = whole.carried_over(optimum.state, problem)
+    optimise(whole, start=start, tolerance=1e9, variances=False)
+    residuals, near = given[0]
+    size = problem.space.size
+    y, along = np.random.default_rng(0).normal(size=(2, size)) * 0.05
+    before, at, after = (residuals(y + h * along, near) for h in (-0.01, 0, 0.01))
+    slope = (after.residual - before.residual) / 0.02
+    off = slope - at.jacobian @ along
+    np.testing.assert_allclose(off[-size:], 0.0, atol=1e-9)  # those of the prior are linear
+    assert np.linalg.norm(off) < 1e-3 * np.linalg.norm(slope)
 
 
 @pytest.mark.slow
