@@ -1,5 +1,6 @@
 """Sampling of the posterior of a fit: the work of `slipid sample` except its pictures."""
 
+import hashlib
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -78,11 +79,13 @@ def sample(
     about = _summary(posterior, plan, time.monotonic() - began) | {"fit": mark}
     marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict) and k != "schema"}
     path = out / "posterior.nc"
+    packed = netcdf.packed(netcdf.tree(posterior, marks), path)
+    about["posterior_sha256"] = hashlib.sha256(packed).hexdigest()
     content = identified(posterior) | {"fit": mark}
     files = {
         out / IDENTIFIED: json_text(content).encode(),
         out / "sample.json": json_text(about).encode(),
-        path: netcdf.packed(netcdf.tree(posterior, marks), path),
+        path: packed,
     }
     write_together(files, [out / name for name in OF_SAMPLE])
     write_robot(out, posterior)
@@ -95,7 +98,7 @@ def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
     """Return the content of sample.json: settings, convergence, diagnosis of each coordinate."""
     d = posterior.diagnosis
     return {
-        "schema": "slipid.sample/1",
+        "schema": "slipid.sample/2",
         "converged": posterior.converged,
         "reason": posterior.reason,
         "ensembles": plan.ensembles,

@@ -22,6 +22,7 @@ import typer
 from slipid.app.config import read_config, single_floor_sections
 from slipid.app.logs import matching_files, packaged_config, packaged_path
 from slipid.cli.main import app
+from slipid.report.html.results import read_results
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
@@ -492,6 +493,7 @@ def test_a_posterior_that_has_not_converged_is_marked_everywhere(sampled):
 
     with xarray.open_datatree(out / "posterior.nc", engine="h5netcdf") as tree:
         assert tree.attrs["converged"] == "False"
+    assert read_results(out).draws
 
 
 @pytest.mark.slow

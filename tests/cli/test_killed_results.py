@@ -19,7 +19,7 @@ from slipid.cli.identify import run
 from slipid.deploy import deploy
 from slipid.deploy.deploy import read_robot
 from slipid.infer.fit_file import load
-from slipid.infer.result_folder import OF_FIT
+from slipid.infer.result_folder import OF_FIT, fit_of
 from slipid.report.html import fit_page
 from slipid.report.html.evidence import read_evidence
 from slipid.report.html.results import read_results
@@ -44,6 +44,7 @@ LATER = {
         "converged": True,
         "reason": "",
         "worst": {"r_hat": 1.0, "effective_draws": 400.0},
+        "posterior_sha256": "0" * 64,
         **_SIZE,
     },
     "validation": {"summary": {"soft": {"contact": _SCORE}}},
@@ -141,8 +142,12 @@ def whole(refits: Refits, sampled: Path, out: Path) -> None:
 def test_two_refits_and_a_killed_one_never_mix(refits, sampled, tmp_path, broken):
     first = tmp_path / "first"
     whole(refits, sampled[0], first)
-    with pytest.MonkeyPatch.context() as patch:  # a posterior of a different fit is refused
-        patch.setattr("slipid.report.html.results._draws", lambda _: {"draws": np.zeros(1)})
+
+    def present(out, sample):  # a posterior that is not that of sample.json is refused
+        return {} if sample is not None and (out / "posterior.nc").exists() else None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("slipid.report.html.results._draws", present)
         assert versions(first)["page"] == {BEFORE}
         rng = np.random.default_rng(0)
         for step in itertools.count():
@@ -185,7 +190,7 @@ def test_every_file_of_a_result_is_known_to_depend_on_the_fit(small, sampled):
 
 def test_the_same_fit_again_keeps_what_was_made_from_it(refits, sampled, tmp_path):
     whole(refits, sampled[0], tmp_path)
-    (tmp_path / "posterior.nc").unlink()  # the page refuses that of a different fit
+    (tmp_path / "posterior.nc").unlink()  # the page refuses that of a different chain
     before = {p.name for p in tmp_path.iterdir()}
     load(tmp_path).save(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == before
@@ -219,7 +224,8 @@ def test_a_robot_or_a_posterior_of_a_different_result_is_refused(refits, sampled
             read(one)
         (one / name).write_bytes(kept)
     shutil.copy(sampled[0] / "posterior.nc", one)
-    with pytest.raises(DataError, match=r"posterior\.nc: of a different fit"):
+    (one / "sample.json").write_text(json.dumps(LATER["sample"] | {"fit": fit_of(one)}))
+    with pytest.raises(DataError, match=r"posterior\.nc: damaged, or of a different chain"):
         read_results(one)
 
 

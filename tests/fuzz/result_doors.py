@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import shutil
@@ -40,14 +41,20 @@ _RESULT = ("*.json", "*.npz", "posterior.nc", "config.toml")
 
 
 def _kept(folder: Path, check: Callable[[Path], Any], make: Callable[[Path], Any]) -> Path:
-    """Return a folder that was made before, made anew where this version does not read it."""
-    try:
-        check(folder)
-    except DataError:
-        if ".cache" not in folder.parts:
-            raise
-        shutil.rmtree(folder, ignore_errors=True)
-        make(folder)
+    """Return a folder that was made before, made anew where this version does not read it.
+
+    Of several processes that need it, one makes it.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with (folder.parent / f"{folder.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            check(folder)
+        except DataError:
+            if ".cache" not in folder.parts:
+                raise
+            shutil.rmtree(folder, ignore_errors=True)
+            make(folder)
     return folder
 
 

@@ -1,5 +1,6 @@
 """Sections of a page, of made contents of a result folder."""
 
+import hashlib
 import json
 import os
 
@@ -205,6 +206,20 @@ def posterior_file(path, lag):
         group["surface"] = np.array([b"wood"])
         group["camera.lag"] = lag
         group["surface.friction"] = np.ones((2, 5, 1))
+    sealed(path)
+
+
+def sample_content(posterior):
+    worst = {"r_hat": 1.1, "effective_draws": 40.0, "steps_per_tau": 9.0}
+    about = {"converged": False, "reason": "40 effective draws", "worst": worst}
+    mark = hashlib.sha256(posterior).hexdigest()
+    return about | {"ensembles": 4, "walkers": 8, "steps": 100, "posterior_sha256": mark}
+
+
+def sealed(path):
+    """Write a sample.json with the hash of a posterior.nc."""
+    content = json.dumps(sample_content(path.read_bytes()))
+    path.with_name("sample.json").write_text(content)
 
 
 DRAWS = np.linspace(0.0, 1.0, 10).reshape(2, 5)
@@ -235,6 +250,9 @@ def test_a_damaged_file_of_draws_is_refused(folder, monkeypatch):
         read_results(folder)
     for damaged in (whole[:300], b"x" * 900, whole.replace(b"surface\0", b"surfacf\0")):
         path.write_bytes(damaged)
+        with pytest.raises(DataError, match=r"posterior\.nc: damaged, or of a different chain"):
+            read_results(folder)
+        sealed(path)
         with pytest.raises(DataError, match=r"posterior\.nc: cannot be read .* run it again"):
             read_results(folder)
 
@@ -433,9 +451,6 @@ def test_a_folder_with_files_of_two_fits_is_refused_with_what_to_do(folder):
 
 
 def test_a_posterior_that_has_not_converged_is_a_warning_with_the_command_to_type(folder):
-    worst = {"r_hat": 1.1, "effective_draws": 40.0, "steps_per_tau": 9.0}
-    sample = {"converged": False, "reason": "40 effective draws", "worst": worst}
-    sample |= {"ensembles": 4, "walkers": 8, "steps": 100}
-    (folder / "sample.json").write_text(json.dumps(sample))
+    (folder / "sample.json").write_text(json.dumps(sample_content(b"")))
     warnings = [b for b in page_of(folder)["verdict"] if getattr(b, "kind", "") == "warning"]
     assert f"slipid sample {folder.name} --most" in words(warnings)

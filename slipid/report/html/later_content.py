@@ -59,6 +59,7 @@ class SampleContent:
     walkers: Count
     steps: Count
     worst: WorstContent
+    posterior_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 @dataclass(frozen=True, config=OPEN)

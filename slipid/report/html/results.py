@@ -1,6 +1,8 @@
 """Results of a fit in a folder, as far as commands have written them so far."""
 
+import hashlib
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from slipid.report.html.evidence import EVIDENCE, FitEvidence, read_evidence
 from slipid.report.html.later_content import COMMANDS, LATER, ShownFitContent
 from slipid.support.content import Content
 from slipid.support.errors import DataError, bad_data, refused_as
-from slipid.support.files import read_json
+from slipid.support.files import read_bytes, read_json
 from slipid.support.toml_file import mapping_of, text_of
 
 RESULT = "a result of `slipid identify`"
@@ -21,6 +23,8 @@ MOST_DRAWS = 1500
 """Largest number of draws of a posterior that are shown."""
 MOST_NUMBERS = 2**26
 """Largest number of values in posterior.nc."""
+MOST_BYTES = 2**30
+"""Largest size of posterior.nc [bytes]."""
 PARTS = ("motor", "camera", "robot", "surface")
 """Parts of a robot whose parameters are shown."""
 
@@ -115,6 +119,7 @@ def read_results(out: Path) -> Results:
             "again"
         )
     outdated = _outdated(out, fit, identified["data"]["hash"])
+    later = {name: None if name in outdated else _later(out, name) for name in LATER}
     return Results(
         folder=out,
         drive=_drive(out / "config.toml"),
@@ -122,8 +127,8 @@ def read_results(out: Path) -> Results:
         run=run,
         fit=_maybe(out / FIT, ShownFitContent, AGAIN),
         evidence=evidence,
-        **{n: None if n in outdated else _later(out, n) for n in LATER},
-        draws=_draws(out) if (out / DRAWS).exists() and "sample" not in outdated else None,
+        **later,
+        draws=_draws(out, later["sample"]),
         exports=tuple(sorted(p.parent.name for p in out.glob("*/SHA256SUMS"))),
         has_robot=(out / "robot.json").exists(),
         outdated=outdated,
@@ -177,20 +182,30 @@ def _maybe(path: Path, kind: type, again: str) -> Content | None:
     return content
 
 
-def _draws(out: Path) -> dict[str, np.ndarray] | None:
+def _draws(out: Path, sample: Content | None) -> dict[str, np.ndarray] | None:
     """Return the draws of scalar parameters in posterior.nc, keyed by path, chain after chain.
 
+    Args:
+        out: folder of the results.
+        sample: content of the sample.json of this fit, which has the hash of the draws' file: HDF5
+            never ends with some damaged files.
+
     Returns:
-        None if h5py, which reads the file, is not installed.
+        None if there is no such content or file, or if h5py, which reads it, is not installed.
     """
+    path = out / DRAWS
+    if sample is None or not path.exists():
+        return None
     try:
         import h5py
     except ImportError:
         return None
-    expected, path = "draws that `slipid sample` wrote; run it again", out / DRAWS
+    expected = "draws that `slipid sample` wrote; run it again"
+    raw = read_bytes(path, expected, MOST_BYTES)
+    if hashlib.sha256(raw).hexdigest() != sample["posterior_sha256"]:
+        raise bad_data(path, "damaged, or of a different chain than sample.json", expected)
     arrays: dict[str, np.ndarray] = {}
-    with refused_as(path, expected), h5py.File(path) as file:
-        mark = file.attrs.get("fit")
+    with refused_as(path, expected), h5py.File(BytesIO(raw)) as file:
         group: Any = file["posterior"]
         if sum(one.size for one in group.values()) > MOST_NUMBERS:
             raise bad_data(path, f"over {MOST_NUMBERS} numbers", expected)
@@ -198,7 +213,6 @@ def _draws(out: Path) -> dict[str, np.ndarray] | None:
         for name, one in group.items():
             if one.dtype == float and name.partition(".")[0] in PARTS:
                 arrays[name] = one[:]
-    refuse_other_fit(out, path, None if mark is None else str(mark))
     found: dict[str, np.ndarray] = {}
     for name, values in arrays.items():
         part, _, rest = name.partition(".")
