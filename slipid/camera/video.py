@@ -54,6 +54,8 @@ class VideoStream:
         try:
             self._file = _opened(av, path)
             self._stream = self._file.streams.video[0]
+            if self._stream.codec_context is None:
+                raise ValueError("its kind of compression is unknown")
         except (av.FFmpegError, IndexError, ValueError) as error:
             reason = "it has no video" if isinstance(error, IndexError) else _message(error)
             raise DataError(
@@ -149,6 +151,21 @@ class VideoStream:
                 self._reason = reason
                 return
 
+    def picture_of(self, frame: Any) -> UInt8[np.ndarray, "row column 3"]:
+        """Return the blue, green and red of a frame of PyAV, as stored, without rotation.
+
+        Raises:
+            DataError: PyAV cannot convert pixels of this format.
+        """
+        try:
+            # threads are started anew for every frame, and end late
+            return np.asarray(frame.to_ndarray(format="bgr24", threads=1))
+        except self._av.FFmpegError as error:
+            raise DataError(
+                f"{self._path}: pixels of the format {frame.format.name} cannot be converted "
+                f"({_message(error)}); expected a video in colours or grey levels"
+            ) from None
+
     def time_of(self, frame: Any) -> float:
         """Return the time of a frame after the start of the stream [s]; NaN if it has none."""
         at = frame.pts if frame.pts is not None else frame.dts
@@ -174,11 +191,6 @@ def _opened(av: ModuleType, path: Path) -> Any:
 def _message(error: Exception) -> str:
     """Return a decoder's message without the names of files and the error's number."""
     return str(getattr(error, "strerror", None) or error)
-
-
-def picture_of(frame: Any) -> UInt8[np.ndarray, "row column 3"]:
-    """Return the blue, green and red of a frame of PyAV, as stored, without rotation."""
-    return np.asarray(frame.to_ndarray(format="bgr24"))
 
 
 def remarks_on(path: Path, frame: Any) -> list[str]:
@@ -265,7 +277,7 @@ class Video(FrameSource):
                     )
                 before = at
                 if k >= first:
-                    yield Frame(k, at, grey_of(picture_of(frame)))
+                    yield Frame(k, at, grey_of(stream.picture_of(frame)))
             self.faults[:] = filter(None, [stream.fault])
 
     def _time(self, k: int, in_file: float) -> float:
@@ -334,7 +346,7 @@ def _median_of(path: Path) -> Still:
         for k, frame in enumerate(stream.frames()):
             if k % every:
                 continue
-            kept.append(picture_of(frame))
+            kept.append(stream.picture_of(frame))
             notes = notes or remarks_on(path, frame)
             if len(kept) == 2 * MEDIAN_FRAMES or len(kept) * kept[0].nbytes > STILL_BYTES:
                 # the video is longer than announced, or large: thin the frames to limit memory

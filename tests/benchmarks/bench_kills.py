@@ -26,7 +26,7 @@ from tests.cli import test_cli
 from tests.helpers import made_bench
 from tests.helpers.track_command import LONE, ROBOT, made_in
 
-TIMES = ("seconds", "fit_s", "predict_s", "finished", "step_us", "tuned_s", "checksum")
+TIMES = ("seconds", "fit_s", "predict_s", "tune_s", "finished", "step_us", "row_us", "checksum")
 """Keys of what differs between two equal results: times, and hashes of what has times."""
 CLOSE = 1e-9
 """Largest relative difference between numbers of equal results."""

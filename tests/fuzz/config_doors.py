@@ -23,13 +23,14 @@ from slipid.camera.frame import read_times
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.picture_file import read_picture
 from slipid.camera.tracking.target import read_targets
+from slipid.camera.video import Video, still
 from slipid.data.floor_map import picture_of, read_map
 from slipid.deploy.floors import FloorLookup
 from slipid.lab.testsite.config import plan
 from slipid.support.progress import Reporter
 from slipid.support.toml_file import text_of
 from tests.fuzz.door import Door
-from tests.helpers import broken_logs, motor_layouts
+from tests.helpers import broken_logs, made_sources, motor_layouts
 
 HERE = Path()
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -389,6 +390,20 @@ def _picture(folder: Path) -> None:
         cv2.imwrite(str(folder / f"picture.{suffix}"), picture)
 
 
+def _videos(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 32, (16, 48, 64), np.uint8) + np.arange(64, dtype=np.uint8)
+    made_sources.encoded(folder / "video.mp4", pictures)
+    made_sources.encoded(folder / "video.mkv", pictures, codec="mpeg4")
+    made_sources.encoded(folder / "video.avi", pictures, codec="mjpeg", pixels="yuvj420p")
+
+
+def _video(path: Path) -> Any:
+    video = Video.at(path, None, None)
+    found = [frame.time for frame in video.frames()]
+    return found, still(path).picture, video.image_px, video.count
+
+
 def _priors(path: Path) -> Any:
     return bench_priors(read_config(HERE / "my.toml"), 16.0)
 
@@ -415,6 +430,7 @@ DOORS = (
     Door("points", _points, lambda path: read_points(path, (640, 480))),
     Door("times", _times, read_times),
     Door("picture", _picture, read_picture),
+    Door("video", _videos, _video, weight=0.2),
     Door("bench_priors", _robot, _priors, ("bench.json",)),
     Door("reference_robot", _references, read_reference),
 )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from fractions import Fraction
+from unittest.mock import Mock
 
 import av
 import cv2
@@ -143,6 +145,31 @@ def test_files_that_are_no_video_are_refused(tmp_path, data):
     (tmp_path / "a.avi").write_bytes(data)
     with pytest.raises(DataError, match=r"a\.avi: .*expected a video"):
         open_source(str(tmp_path / "a.avi"))
+
+
+def test_a_video_of_an_unknown_compression_is_refused(tmp_path):
+    path = encoded(tmp_path / "a.mp4", pictures())
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzzz"))
+    with pytest.raises(DataError, match=r"a\.mp4: not a video .*its kind of compression is unk"):
+        open_source(str(path))
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="/proc lists no threads here")
+def test_converted_frames_keep_no_threads(tmp_path):
+    with VideoStream(encoded(tmp_path / "a.mp4", pictures())) as stream:
+        frames = list(stream.frames())
+        usual = len(os.listdir("/proc/self/task"))
+        converted = [stream.picture_of(frame) for frame in frames]
+        assert len(os.listdir("/proc/self/task")) <= usual
+        assert len(converted) == COUNT
+
+
+def test_frames_that_cannot_be_converted_are_refused(tmp_path, monkeypatch):
+    with VideoStream(encoded(tmp_path / "a.mp4", pictures())) as stream:
+        monkeypatch.setattr(stream, "_av", Mock(FFmpegError=ValueError))
+        frame = Mock(**{"to_ndarray.side_effect": ValueError("odd"), "format.name": "hard"})
+        with pytest.raises(DataError, match=r"a\.mp4: pixels of the format hard cannot be conv"):
+            stream.picture_of(frame)
 
 
 def test_places_without_anything(tmp_path):
