@@ -29,36 +29,12 @@ from slipid.support.files import write_bytes
 from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 from tests.helpers.killed_writes import Killed, dies_at, disk_full_at
+from tests.helpers.later_files import LATER
 from tests.helpers.shared import FEW, invoke
 
 pytestmark = pytest.mark.slow
 BEFORE, FIRST, SECOND = 1.0, 2.0, 3.0
 """Numbers of the fits that replace each other in one folder, the last two by refits."""
-_SIZE = {"ensembles": 4, "walkers": 8, "steps": 72}
-_SCORE = {"endpoint_error_over_path_mean": 0.1, "heading_error_median_deg": 1.0}
-_SCORE |= {"coverage90": 0.9, "runs": 3}
-_ERRORS = {"closure_error_median": 9.0, "cross_track_rmse": 5.0, "heading_error_deg": 1.0}
-_DRIVEN = {"finished_share": 1.0, "runs": 3, "interval90": {"closure_error_median": [8.0, 10.0]}}
-LATER = {
-    "sample": {
-        "converged": True,
-        "reason": "",
-        "worst": {"r_hat": 1.0, "effective_draws": 400.0},
-        "posterior_sha256": "0" * 64,
-        **_SIZE,
-    },
-    "validation": {"summary": {"soft": {"contact": _SCORE}}},
-    "trial": {
-        "summary": {"encoder": _ERRORS | _DRIVEN},
-        "controllers": {"encoder": "by the wheels"},
-        "verdict": "no difference",
-        "path": "square",
-        "speed_m_s": 0.2,
-        "plant": "twin",
-        "map": "patches",
-    },
-}
-"""Contents of the files of later commands, without the fit to which they belong."""
 
 
 class Refits:

@@ -19,7 +19,7 @@ from slipid.exports.folder import check_folder
 from slipid.exports.stablehlo import load_program
 from slipid.infer.fit_file import load
 from slipid.report.html.evidence import read_evidence
-from slipid.report.html.fit_page import write_report
+from slipid.report.html.fit_page import fit_page, write_report
 from slipid.report.html.results import read_results
 from slipid.robot.filter.floor import Floor
 from slipid.robot.record import RobotRecord
@@ -28,6 +28,7 @@ from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
 from slipid.support.files import checksum
 from tests.fuzz.door import Door, Files, Silent
+from tests.helpers.later_files import COMPARISON, LATER
 
 HERE = Path()
 OUT = Path(__file__).resolve().parents[2] / ".cache" / "fuzz" / "out"
@@ -140,6 +141,21 @@ def _page(path: Path) -> Any:
     return read_json(HERE / "identified.json", "a result")["derived"]
 
 
+def _later(folder: Path) -> None:
+    _results()(folder)
+    fit, logs = (json.loads((folder / "identified.json").read_text())[k] for k in ("fit", "data"))
+    contents = {name: {"fit": fit, **one} for name, one in LATER.items() if name != "sample"}
+    contents["comparison"] = {"data": {"hash": logs["hash"]}, **COMPARISON}
+    for name, content in contents.items():
+        (folder / f"{name}.json").write_text(json.dumps(content), encoding="utf-8")
+
+
+def _later_page(path: Path) -> Any:
+    found = read_results(HERE)
+    fit_page(found)
+    return found.validation, found.trial, found.comparison, found.design
+
+
 def _checkpoint(folder: Path) -> None:
     kept = Checkpoint(folder, "K")
     kept.save("a", ARRAYS)
@@ -218,6 +234,13 @@ FITS = (
         _page,
         ("identified.json", "run.json", "evidence.json", "sample.json"),
         weight=0.02,
+    ),
+    Door(
+        "later_files",
+        _later,
+        _later_page,
+        ("validation.json", "trial.json", "comparison.json", "design.json"),
+        weight=0.2,
     ),
     Door("run_file", _results("run.json"), lambda _: log_folder(HERE, None)),
     Door("calibration", _results("identified.json"), lambda _: read_calibration(HERE)),
