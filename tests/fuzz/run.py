@@ -239,9 +239,9 @@ def corpus_of(door: Door) -> list[tuple[str, Path]]:
 
 
 def shares(doors: Sequence[Door], count: int) -> dict[str, int]:
-    """Return the number of cases of each door, `count` in total, by the doors' weights."""
+    """Return the number of cases of each door, at least `count` in total, by weight."""
     whole = sum(door.weight for door in doors)
-    return {door.name: round(count * door.weight / whole) for door in doors}
+    return {door.name: math.ceil(count * door.weight / whole) for door in doors}
 
 
 def try_door(
