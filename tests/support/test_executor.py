@@ -6,6 +6,8 @@ import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 from slipid.support.errors import DataError
@@ -21,6 +23,10 @@ def square(k: int) -> int:
 
 def where(_: int) -> int:
     return os.getpid()
+
+
+def received(array: jax.Array) -> tuple[str, float]:
+    return str(array.dtype), float(array)
 
 
 def gone(_: int) -> int:
@@ -45,6 +51,9 @@ def test_any_executor_of_the_standard_library_does(engine):
 def test_processes_are_others_and_a_dead_one_is_an_error():
     with Processes(2) as executor:
         assert os.getpid() not in results(executor, where, TODO, Reporter(quiet=True))
+    with Processes(1) as executor:
+        third = {"array": jnp.asarray(1 / 3)}
+        assert results(executor, received, third, Reporter(quiet=True)) == [("float64", 1 / 3)]
     with (
         pytest.raises(DataError, match="a worker process ended before its job"),
         Processes(1) as executor,
