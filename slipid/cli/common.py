@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, ParamSpec
 import typer
 from typer.models import OptionInfo
 
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, shown
 from slipid.support.quantities import limits_of
 
 if TYPE_CHECKING:
@@ -117,6 +117,8 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
             _check_json(options.get("json"))
+            if not (out := str(options.get("out", ""))).isprintable():
+                raise DataError(f"{shown(out)}: a name to write to; expected printable characters")
             _refuse_nan(options)
             code = command(*args, **options)
         except KeyboardInterrupt:

@@ -288,6 +288,22 @@ def test_commands_suggest_what_to_type_next(small, sampled):
     assert (name, words[-1]) == ("identify", "out/my")
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("sample", "a\x1b"), r"'a\x1b': a name to write to; expected printable characters"),
+        (("sample", "a", "--json", "*"), "--json '*': no name of a file; expected a path without"),
+        (("check", "a", "--data", ".", "--json", "/dev/full"), "--json /dev/full: cannot be wri"),
+    ],
+)
+def test_names_to_write_to_are_checked_before_the_work(tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    result = invoke(*words)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_validate_predicts_unseen_runs(small, tmp_path):
     folder, _ = small
