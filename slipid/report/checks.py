@@ -42,7 +42,7 @@ def show_check(page: Page, found: Content) -> None:
     if found["parameters"]:
         _show_expected(page, found["parameters"] | found["derived"])
     page.notes(found["messages"])
-    page.notes(found.get("suspects", ()), first=True)
+    page.notes((*found.get("skipped", ()), *found.get("suspects", ())), first=True)
     page.notes(f"repaired in {count} runs: {note}" for note, count in found["notes"].items())
 
 
