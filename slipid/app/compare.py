@@ -34,6 +34,7 @@ from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import load
 from slipid.infer.result import Fit
+from slipid.infer.result_folder import FIT, IDENTIFIED
 from slipid.infer.summary import summarise
 from slipid.predict.folds import Fold, folds_of, judge, like_held_out
 from slipid.predict.kinematics import nominal
@@ -314,6 +315,11 @@ def validate_calibration(
     """
     setup_jax(quiet=True)
     found = read_calibration(out)
+    if "contact" in found.models.values():
+        raise DataError(
+            f"{out / FIT}: missing, though {IDENTIFIED} beside it is of a fit; "
+            "run `slipid identify` again"
+        )
     config, dataset = _judged(out, data, report, glob)
     shape, fitted = shape_of(config), set(found.runs)
     new = sum(log.name not in fitted for log in dataset.logs)

@@ -13,8 +13,10 @@ from slipid.camera.frame import Frame, FrameSource, Times, even_times, grey_of, 
 from slipid.camera.opencv import cv2, size_of
 from slipid.camera.picture_file import is_picture, pictures_in, read_picture
 from slipid.camera.video import Video
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, shown
 
+LONGEST_NUMBER = 4
+"""Largest number of digits in the number of a camera device."""
 MOST_BROKEN = 25
 """Number of consecutive frames that a device may fail to supply before it counts as stopped."""
 
@@ -27,7 +29,7 @@ class Capture:
     """
 
     def __init__(self, place: str):
-        self._capture = cv2.VideoCapture(int(place) if place.isdigit() else place)
+        self._capture = cv2.VideoCapture(int(place) if place.isdecimal() else place)
         if not self._capture.isOpened():
             raise DataError(
                 f"device {place}: OpenCV cannot open it; expected a camera that is plugged in"
@@ -154,7 +156,9 @@ def open_source(
     if fps is not None and times is not None:
         raise DataError("both --fps and --times are given; expected one of them")
     path = Path(place)
-    if place.isdigit() or place.startswith("/dev/video"):
+    if place.isdecimal() and len(place) > LONGEST_NUMBER:
+        raise DataError(f"device {shown(place)}: no such number; expected that of a camera, as 0")
+    if place.isdecimal() or place.startswith("/dev/video"):
         if seconds is None or not 0 < seconds < float("inf"):
             raise DataError(
                 f"device {place}: no duration; expected --seconds with the recording's duration, "

@@ -68,6 +68,8 @@ Jobs = Annotated[
     int | None,
     typer.Option(min=1, max=1024, help="Number of parallel processes; by default one per core."),
 ]
+LONGEST_NAME = 255
+"""Length of the longest name of a file or a folder [bytes]."""
 MOST_SEED = 2**32 - 1
 """Largest seed of random numbers."""
 Json = Annotated[
@@ -117,6 +119,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
             _check_json(options.get("json"))
+            _refuse_long_names(options)
             if not (out := str(options.get("out", ""))).isprintable():
                 raise DataError(f"{shown(out)}: a name to write to; expected printable characters")
             _refuse_nan(options)
@@ -153,6 +156,15 @@ def _check_json(name: object) -> None:
         target_of(Path(name))
     except DataError as error:
         raise DataError(f"--json {error}, or - for standard output") from error
+
+
+def _refuse_long_names(options: Mapping[str, object]) -> None:
+    """Raise `DataError` for a path with a name that is too long for a file system."""
+    for path in (value for value in options.values() if isinstance(value, Path)):
+        if max(map(len, map(os.fsencode, path.parts)), default=0) > LONGEST_NAME:
+            raise DataError(
+                f"{shown(str(path))}: a name of over {LONGEST_NAME} bytes; expected a shorter one"
+            )
 
 
 def _refuse_nan(options: Mapping[str, object]) -> None:

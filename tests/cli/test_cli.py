@@ -291,6 +291,7 @@ def test_commands_suggest_what_to_type_next(small, sampled):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (("report", "x" * 300), "xx': a name of over 255 bytes; expected a shorter one"),
         (("sample", "a\x1b"), r"'a\x1b': a name to write to; expected printable characters"),
         (("sample", "a", "--json", "*"), "--json '*': no name of a file; expected a path without"),
         (("check", "a", "--data", ".", "--json", "/dev/full"), "--json /dev/full: cannot be wri"),
@@ -334,6 +335,12 @@ def test_validate_reports_fitted_runs_and_unknown_floors(small, tmp_path):
     assert result.exit_code == 2
     assert "'ice'" in result.stderr
     assert "identified: soft" in result.stderr
+    lost = tmp_path / "lost"
+    shutil.copytree(folder / "out", lost)
+    (lost / "fit.json").unlink()
+    result = invoke("validate", lost, "--data", folder / "unseen")
+    assert result.exit_code == 2
+    assert "fit.json: missing, though identified.json beside it is of a fit" in result.stderr
 
 
 @pytest.mark.slow

@@ -222,6 +222,11 @@ def test_a_folder_without_pictures(tmp_path):
 # devices ----------------------------------------------------------------------------------------
 
 
+def test_a_device_has_a_number_of_a_camera():
+    with pytest.raises(DataError, match="device '9999999999999': no such number"):
+        open_source("9" * 13, seconds=1.0)
+
+
 def test_a_device_needs_an_end_and_has_its_own_times():
     with pytest.raises(DataError, match="expected --seconds with the recording's duration"):
         open_source("0")
