@@ -68,6 +68,8 @@ Jobs = Annotated[
     int | None,
     typer.Option(min=1, max=1024, help="Number of parallel processes; by default one per core."),
 ]
+OVERWRITTEN_BY_NO_OPTION = ("slipid.fit/", "slipid.robot/", "slipid.run/")
+"""Beginnings of the schemas of files without which a result is lost."""
 LONGEST_NAME = 255
 """Length of the longest name of a file or a folder [bytes]."""
 MOST_SEED = 2**32 - 1
@@ -118,7 +120,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     @functools.wraps(command)
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
-            _check_json(options.get("json"))
+            _check_json(options)
             _refuse_long_names(options)
             if not (out := str(options.get("out", ""))).isprintable():
                 raise DataError(f"{shown(out)}: a name to write to; expected printable characters")
@@ -138,14 +140,16 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     return run
 
 
-def _check_json(name: object) -> None:
-    """Raise `DataError` unless the value of `--json` is `-`, None or the name of a possible file.
+def _check_json(options: Mapping[str, object]) -> None:
+    """Raise `DataError` unless the option `json` is `-`, None or the name of a file to write.
 
-    This is checked first, as the file is written after the work.
+    This is checked first, as the file is written after the work. A file that is there must be the
+    JSON of an earlier result, and neither a part of a fit nor the file of a different option.
     """
+    name = options.get("json")
     if not isinstance(name, str) or name == "-":
         return
-    from slipid.support.files import target_of
+    from slipid.support.files import read_json, target_of
 
     if not name or any(c in "*?" or not c.isprintable() for c in name):
         raise DataError(
@@ -153,9 +157,23 @@ def _check_json(name: object) -> None:
             "standard output"
         )
     try:
-        target_of(Path(name))
+        target = target_of(Path(name))
     except DataError as error:
         raise DataError(f"--json {error}, or - for standard output") from error
+    others = (value for key, value in options.items() if key != "json" and isinstance(value, Path))
+    if any(target == Path(os.path.realpath(path)) for path in others):
+        raise DataError(f"--json {name}: the file of a different option; expected one of its own")
+    if target.exists() and target.stat().st_size:
+        try:
+            found = read_json(target, "JSON")
+        except DataError:
+            found = None
+        schema = str(found.get("schema", "")) if isinstance(found, dict) else None
+        if schema is None or schema.startswith(OVERWRITTEN_BY_NO_OPTION):
+            raise DataError(
+                f"--json {name}: a file that is no JSON of an earlier result, and would be "
+                "overwritten; expected the name of a new file"
+            )
 
 
 def _refuse_long_names(options: Mapping[str, object]) -> None:

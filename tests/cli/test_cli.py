@@ -305,6 +305,24 @@ def test_names_to_write_to_are_checked_before_the_work(tmp_path, monkeypatch, wo
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    "content", ["[robot]", "time,x\n1,2\n", '{"schema": "slipid.fit/9"}', "[]"]
+)
+def test_json_overwrites_no_file_that_is_not_the_json_of_a_result(tmp_path, content):
+    path = tmp_path / "mine"
+    path.write_text(content)
+    result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", path)
+    assert result.exit_code == 2
+    assert "mine: a file that is no JSON of an earlier result, and would be" in result.stderr
+    assert path.read_text() == content
+    result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", tmp_path / "a.toml")
+    assert "a.toml: the file of a different option" in result.stderr
+    path.write_text('{"schema": "slipid.check/1"}')
+    result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", path)
+    assert "a.toml" in result.stderr
+    assert "--json" not in result.stderr
+
+
 @pytest.mark.slow
 def test_validate_predicts_unseen_runs(small, tmp_path):
     folder, _ = small
