@@ -121,9 +121,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
             _check_json(options)
-            _refuse_long_names(options)
-            if not (out := str(options.get("out", ""))).isprintable():
-                raise DataError(f"{shown(out)}: a name to write to; expected printable characters")
+            _check_names(options)
             _refuse_nan(options)
             code = command(*args, **options)
         except KeyboardInterrupt:
@@ -143,8 +141,9 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
 def _check_json(options: Mapping[str, object]) -> None:
     """Raise `DataError` unless the option `json` is `-`, None or the name of a file to write.
 
-    This is checked first, as the file is written after the work. A file that is there must be the
-    JSON of an earlier result, and neither a part of a fit nor the file of a different option.
+    This is checked first, as the file is written after the work. A file that is there must hold a
+    JSON object, as all results do, and be neither a part of a fit nor the file of a different
+    option.
     """
     name = options.get("json")
     if not isinstance(name, str) or name == "-":
@@ -176,8 +175,10 @@ def _check_json(options: Mapping[str, object]) -> None:
             )
 
 
-def _refuse_long_names(options: Mapping[str, object]) -> None:
-    """Raise `DataError` for a path with a name that is too long for a file system."""
+def _check_names(options: Mapping[str, object]) -> None:
+    """Raise `DataError` for a path with too long a name, and for control characters in `out`."""
+    if not (out := str(options.get("out", ""))).isprintable():
+        raise DataError(f"{shown(out)}: a name to write to; expected printable characters")
     for path in (value for value in options.values() if isinstance(value, Path)):
         if max(map(len, map(os.fsencode, path.parts)), default=0) > LONGEST_NAME:
             raise DataError(

@@ -17,7 +17,6 @@ from types import TracebackType
 from typing import ParamSpec, TypeVar
 
 from slipid.support.errors import DataError
-from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 Given = TypeVar("Given")
@@ -40,13 +39,11 @@ class Processes(ProcessPoolExecutor):
     """Executor with processes on this machine, which are started on demand.
 
     The processes end when the process that started them is interrupted or killed. They are spawned,
-    not forked, since forked processes would inherit the threads of the caller's libraries. JAX is
-    set up in each of them before it receives its first job, whose arrays would else be rounded to
-    float32.
+    not forked, since forked processes would inherit the threads of the caller's libraries.
     """
 
     def __init__(self, jobs: int) -> None:
-        super().__init__(jobs, get_context("spawn"), _set_up, (os.getpid(),))
+        super().__init__(jobs, get_context("spawn"), _end_with, (os.getpid(),))
         self._others = set(active_children())
 
     def submit(
@@ -126,13 +123,12 @@ def _interrupts_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _set_up(parent: int) -> None:
+def _end_with(parent: int) -> None:
     """Set up a process that ignores interrupts and ends when its parent process has ended.
 
     `parent` is the id of the parent process.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    setup_jax(quiet=True)
 
     def watch() -> None:
         while os.getppid() == parent:

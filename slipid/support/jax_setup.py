@@ -76,6 +76,8 @@ def setup_jax(quiet: bool = False) -> None:
     one_blas_thread()
 
     jax.config.update("jax_enable_x64", True)
+    # processes of jobs inherit this, or the arrays of their first job would be rounded to float32
+    os.environ["JAX_ENABLE_X64"] = "1"
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ or "SLIPID_CACHE" in os.environ:
         folder = cache_folder() / "jax"
         with suppress(OSError):

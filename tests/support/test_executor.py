@@ -12,6 +12,7 @@ import pytest
 
 from slipid.support.errors import DataError
 from slipid.support.executor import InProcess, Processes, results
+from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 TODO = {f"number {k}": k for k in range(5)}
@@ -51,6 +52,7 @@ def test_any_executor_of_the_standard_library_does(engine):
 def test_processes_are_others_and_a_dead_one_is_an_error():
     with Processes(2) as executor:
         assert os.getpid() not in results(executor, where, TODO, Reporter(quiet=True))
+    setup_jax(quiet=True)
     with Processes(1) as executor:
         third = {"array": jnp.asarray(1 / 3)}
         assert results(executor, received, third, Reporter(quiet=True)) == [("float64", 1 / 3)]

@@ -177,13 +177,11 @@ class Chessboard(PrintedBoard):
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
         shape = (self.columns - 1, self.rows - 1)
         found, rough = cv2.findChessboardCornersSB(copy, shape, flags=flags)
-        if not found:
+        if not found or not _regular(np.asarray(rough, float).reshape(*shape[::-1], 2)):
             return np.zeros((0, 2)), np.zeros((0, 2))
         scale = np.array(size_of(grey)) / size_of(copy)
         pixels = ((np.asarray(rough, float).reshape(-1, 2) + 0.5) * scale - 0.5).astype(np.float32)
         grid = pixels.reshape(*shape[::-1], 2)
-        if not _regular(grid):
-            return np.zeros((0, 2)), np.zeros((0, 2))
         steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
         reach = max(2, int(REFINED_SHARE * min(steps)))
         until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
