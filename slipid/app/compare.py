@@ -17,7 +17,7 @@ from slipid.app.calibrate import calibrated, read_calibration
 from slipid.app.config import Config, read_config, shape_of, single_floor_sections
 from slipid.app.floor_maps import map_files
 from slipid.app.identify import with_mixed_runs
-from slipid.app.logs import read_dataset
+from slipid.app.logs import config_of_fit, read_dataset
 from slipid.app.problem import (
     ConfigFitTask,
     FitTask,
@@ -330,7 +330,7 @@ def validate_calibration(
 
 def _judged(out: Path, data: Path, report: Reporter, glob: str | None) -> tuple[Config, Runs]:
     """Return the config in a result folder, and the runs that it or a pattern names."""
-    config = read_config(out / "config.toml")
+    config = config_of_fit(out)
     logs, others = config.content.logs, config.content.validate_.logs
     sections = single_floor_sections([*others, *logs] if glob is not None else others or logs)
     report.stage("reading logs")

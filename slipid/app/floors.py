@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.app.config import LogsSection, read_config
-from slipid.app.logs import read_dataset
+from slipid.app.config import LogsSection
+from slipid.app.logs import config_of_fit, read_dataset
 from slipid.data.log import Log
 from slipid.data.reading.reader import find_logs
 from slipid.deploy.floors import FloorLookup
@@ -18,6 +18,7 @@ from slipid.model.robot import Robot
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
+from slipid.support.folder import refuse_foreign
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.floors/1"
@@ -64,7 +65,7 @@ def floors_under(
     """
     fit = load(out)
     lookup = FloorLookup.read(map_file)
-    config = read_config(out / "config.toml")
+    config = config_of_fit(out)
     named = config.content.logs
     sections = [section for section in named if section.map is not None]
     if glob is not None:
@@ -110,13 +111,17 @@ def _run_floors(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Ru
 def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> list[Path]:
     """Write a CSV file for each run, and return the paths of the files.
 
-    The columns are time [s], pose [m, rad], and the floor and border distance [m] of each wheel.
+    Files of other origin are not overwritten. The columns are time [s], pose [m, rad], and the
+    floor and border distance [m] of each wheel.
     """
-    paths = []
-    for run in runs:
-        wheels = range(1, run.surface.shape[1] + 1)
-        names = [f"{what}_{wheel}" for what in ("floor", "border") for wheel in wheels]
-        lines = [",".join(["time", "x", "y", "heading", *names])]
+    paths = [folder / Path(run.name.replace("#", "_")).with_suffix(".csv") for run in runs]
+    wheels = range(1, runs[0].surface.shape[1] + 1)
+    names = [f"{what}_{wheel}" for what in ("floor", "border") for wheel in wheels]
+    head = ",".join(["time", "x", "y", "heading", *names])
+    for path in paths:
+        refuse_foreign(path, head.encode())
+    for path, run in zip(paths, runs, strict=True):
+        lines = [head]
         known = run.inside & np.isfinite(run.border)
         for k, time in enumerate(run.time):
             numbers = [f"{v:.5f}" for v in (time, *run.pose[k])]
@@ -125,9 +130,7 @@ def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> li
                 f"{v:.4f}" if i else "" for v, i in zip(run.border[k], known[k], strict=True)
             ]
             lines.append(",".join([*numbers, *floors, *borders]))
-        path = folder / Path(run.name.replace("#", "_")).with_suffix(".csv")
         write_bytes(path, "\n".join([*lines, ""]).encode())
-        paths.append(path)
     return paths
 
 

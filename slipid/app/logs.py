@@ -8,7 +8,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from slipid.app.config import BenchMotors, Config, LogsSection, shape_of
+from slipid.app.config import BenchMotors, Config, LogsSection, parsed, shape_of
 from slipid.data.gyro_heading import with_gyro_heading
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
@@ -24,7 +24,7 @@ from slipid.data.reading.reader import (
 )
 from slipid.data.runs import Runs, collect, counted_once
 from slipid.infer.result_content import RunContent, checked_result
-from slipid.infer.result_folder import RUN
+from slipid.infer.result_folder import CONFIG, RUN, config_text
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError, bad_data, did_you_mean, refused_as
@@ -56,6 +56,11 @@ def read_run_file(out: Path) -> RunContent:
     """
     content = read_json(out / RUN, "the run.json that `slipid identify` writes")
     return checked_result(out / RUN, content, RunContent)
+
+
+def config_of_fit(out: Path) -> Config:
+    """Return the config of the fit in a result folder; raise `DataError` as `config_text` does."""
+    return parsed(out / CONFIG, config_text(out))
 
 
 def read_dataset(

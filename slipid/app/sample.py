@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.app.config import read_config
-from slipid.app.logs import log_folder
+from slipid.app.logs import config_of_fit, log_folder
 from slipid.app.problem import ConfigFitTask, read_fit_task, with_mixed
 from slipid.deploy.deploy import write_robot
 from slipid.fitting.multi_floor import multi_floor_runs
@@ -58,7 +57,7 @@ def sample(
     setup_jax(quiet=True)
     fit = load(out)
     folder = log_folder(out, data)
-    task = read_fit_task(read_config(out / "config.toml"), folder, report)
+    task = read_fit_task(config_of_fit(out), folder, report)
     task = replace(task, choices=fit.choices)  # those of the calibration are not in the config
     if fit.mixed is not None:
         task = with_mixed(task, folder, report)

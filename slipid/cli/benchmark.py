@@ -53,7 +53,11 @@ def benchmark(
     from slipid.report.html.page import try_page
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
-    with Reporter(quiet=quiet) as report, locked(out, "benchmark"), executor_of(jobs) as executor:
+    with (
+        Reporter(quiet=quiet) as report,
+        locked(out, "benchmark", "benchmark.json", PAGE),
+        executor_of(jobs) as executor,
+    ):
         found = run(BenchmarkOptions(data, out, only, quick), executor, report)
         report.stage("writing the page")
         files = (*try_page(benchmark_page(found), out / PAGE, report), "benchmark.json")
@@ -86,7 +90,7 @@ def paper(
     require("matplotlib", "report", "`slipid paper`")
     from slipid.lab.paper2021.plots import run
 
-    with locked(out, "paper"):
+    with locked(out, "paper", "paper.json"):
         for path in run(data, out):
             typer.echo(str(path))
     suggest([Next("compare it with other systems", ("benchmark", "--data", data))])

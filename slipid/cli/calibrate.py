@@ -126,7 +126,9 @@ def calibrate(
         lens_from_pictures,
     )
     from slipid.camera.calibration.quality import TooLittleCovered
+    from slipid.support.folder import MARKS, refuse_foreign
 
+    refuse_foreign(out, MARKS[".json"])
     words, described = pictures or [], (metres_per_pixel, lens_height, turn)
     std = SIZE_STD if size_std is None else _positive("--size-std", size_std)
     if any(value is not None for value in described):

@@ -70,6 +70,8 @@ Jobs = Annotated[
 ]
 OVERWRITTEN_BY_NO_OPTION = ("slipid.fit/", "slipid.robot/", "slipid.run/")
 """Beginnings of the schemas of files without which a result is lost."""
+OUTPUTS = frozenset(("json", "out", "preview"))
+"""Options whose values are written to."""
 LONGEST_NAME = 255
 """Length of the longest name of a file or a folder [bytes]."""
 MOST_SEED = 2**32 - 1
@@ -121,6 +123,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
             _check_json(options)
+            _refuse_own_input(options)
             _check_names(options)
             _refuse_nan(options)
             code = command(*args, **options)
@@ -141,9 +144,8 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
 def _check_json(options: Mapping[str, object]) -> None:
     """Raise `DataError` unless the option `json` is `-`, None or the name of a file to write.
 
-    This is checked first, as the file is written after the work. A file that is there must hold a
-    JSON object, as all results do, and be neither a part of a fit nor the file of a different
-    option.
+    This is checked first, as the file is written after the work. A file that is there must be a
+    JSON result of slipid, but no part of a fit.
     """
     name = options.get("json")
     if not isinstance(name, str) or name == "-":
@@ -159,20 +161,33 @@ def _check_json(options: Mapping[str, object]) -> None:
         target = target_of(Path(name))
     except DataError as error:
         raise DataError(f"--json {error}, or - for standard output") from error
-    others = (value for key, value in options.items() if key != "json" and isinstance(value, Path))
-    if any(target == Path(os.path.realpath(path)) for path in others):
-        raise DataError(f"--json {name}: the file of a different option; expected one of its own")
     if target.exists() and target.stat().st_size:
         try:
             found = read_json(target, "JSON")
         except DataError:
             found = None
-        schema = str(found.get("schema", "")) if isinstance(found, dict) else None
-        if schema is None or schema.startswith(OVERWRITTEN_BY_NO_OPTION):
+        schema = str(found.get("schema", "")) if isinstance(found, dict) else ""
+        if not schema.startswith("slipid.") or schema.startswith(OVERWRITTEN_BY_NO_OPTION):
             raise DataError(
                 f"--json {name}: a file that is no JSON of an earlier result, and would be "
                 "overwritten; expected the name of a new file"
             )
+
+
+def _refuse_own_input(options: Mapping[str, object]) -> None:
+    """Raise `DataError` if a file to write to is also the file of a different option."""
+    files = {
+        key: os.path.realpath(value)
+        for key, value in options.items()
+        if isinstance(value, Path) or (key in ("json", "source") and isinstance(value, str))
+    }
+    for written in OUTPUTS & files.keys():
+        for key in files.keys() - {written}:
+            if files[key] == files[written] and not os.path.isdir(files[key]):
+                raise DataError(
+                    f"--{written} {shown(str(options[written]))}: also the file of the option "
+                    f"{key.replace('_', '-')}, and would be overwritten; expected a different name"
+                )
 
 
 def _check_names(options: Mapping[str, object]) -> None:

@@ -87,13 +87,19 @@ def run(
         raise DataError(f"--plant {plant}: unknown; expected recorded or mujoco")
     if plant == "recorded" and seed is not None:
         raise DataError("--seed is given without a simulation; expected --plant mujoco with it")
+    config, text = out / "robotino.toml", packaged_config("robotino.toml").encode()
+    if config.is_file() and config.read_bytes() != text:
+        raise DataError(
+            f"{config}: differs from the config of the demo, and would be overwritten; expected "
+            "a different folder (or move the file away)"
+        )
     source = out / plant
     if plant == "recorded":
         report.stage("unpacking recorded logs")
         unpack(source)
     else:
         drive_anew(source, seed or 0, executor, report)
-    write_bytes(out / "robotino.toml", packaged_config("robotino.toml").encode())
+    write_bytes(config, text)
     result = out / "result"
     logs = source / "fit" / "logs"
     done = identify(checked_task(out / "robotino.toml", logs, report), logs, result, report)

@@ -77,7 +77,7 @@ def design(
     from slipid.support.jax_setup import setup_jax
 
     goals, places = (parameter or (), predict or ()), (floor or (), load or ())
-    with Reporter(quiet=quiet) as report, locked(out, "design"):
+    with Reporter(quiet=quiet) as report, locked(out, "design", "design.json", "design.png"):
         setup_jax(quiet=True)
         fit = load_fit(out)
         report.stage("simulating candidate runs", usual_s=SIMULATING_S)

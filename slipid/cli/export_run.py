@@ -48,9 +48,11 @@ def export_run(
     from slipid.app.run_export.mcap_file import mcap_of, require_mcap
     from slipid.app.run_export.run_view import run_view
     from slipid.support.files import write_bytes
+    from slipid.support.folder import MARKS, refuse_foreign
     from slipid.support.jax_setup import setup_jax
 
     require_mcap()
+    refuse_foreign(out, MARKS[".mcap"])
     setup_jax(quiet=True)
     with Reporter(quiet=quiet) as report:
         view = run_view(fitted, run, data, map, report)

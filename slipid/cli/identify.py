@@ -61,6 +61,7 @@ def identify(
     """
     from slipid.app.config import BenchMotors, read_config
     from slipid.app.identify import IdentifyResult, checked_task
+    from slipid.infer.result_folder import WRITTEN, refuse_foreign_config
     from slipid.report.calibration import show_calibration, show_trust
     from slipid.report.estimates import show_fit
     from slipid.report.gains import show_gains
@@ -75,7 +76,8 @@ def identify(
         if only:
             raise DataError("--only calibration: a motor on a bench has no kinematics to calibrate")
         return bench(wanted, data, out, profile or (), json, quiet)
-    with Reporter(quiet=quiet) as report, locked(out, "identify"):
+    with Reporter(quiet=quiet) as report, locked(out, "identify", *WRITTEN):
+        refuse_foreign_config(out, wanted.text)
         task = checked_task(config, data, report, anyway)
         if reason := task.calibration_only:
             report.line(f"calibration alone: {reason}")
@@ -173,13 +175,15 @@ def bench(
 ) -> int:
     """Identify motors on a bench, write and print the result, and return the exit code."""
     from slipid.app.bench import bench_content, identify_bench
+    from slipid.infer.result_folder import WRITTEN, refuse_foreign_config
     from slipid.report.estimates import show_bench
     from slipid.report.html.bench_page import bench_page
     from slipid.report.html.page import REPORT, try_page
 
     if profile:
         raise DataError("--profile is not available for drive = 'motor'; omit it")
-    with Reporter(quiet=quiet) as report, locked(out, "identify"):
+    with Reporter(quiet=quiet) as report, locked(out, "identify", *WRITTEN):
+        refuse_foreign_config(out, config.text)
         fit, written = identify_bench(config, data, out, report)
         if can_draw(report):
             from slipid.plots.bench import bench_plots

@@ -106,7 +106,7 @@ def motor(
         ignored=frozenset(ignore or ()),
     )
     given = {c: given_columns(text, c) for c, text in columns.items() if text is not None}
-    with Reporter(quiet=quiet) as report, locked(out, "motor"):
+    with Reporter(quiet=quiet) as report, locked(out, "motor", "motor.json", "report.html"):
         report.stage("reading the log")
         task = read_motor_log(file, given, delimiter, options, between)
         fit = task.fit(report)

@@ -25,7 +25,7 @@ def report(
     """
     from slipid.report.html.fit_page import renew
 
-    with Reporter(quiet=quiet) as progress, locked(out, "report"):
+    with Reporter(quiet=quiet) as progress, locked(out, "report", "report.html"):
         path = renew(out, data, progress)
     typer.echo(f"look at: {path}")
     suggest([Next("take it to the robot", ("export", out, "--out", out / "to_go"))])

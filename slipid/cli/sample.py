@@ -60,7 +60,7 @@ def sample(
     from slipid.app.sample import WRITTEN
     from slipid.app.sample import sample as run
 
-    with Reporter(quiet=quiet) as report, locked(out, "sample"):
+    with Reporter(quiet=quiet) as report, locked(out, "sample", "sample.json"):
         posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
         written = [*WRITTEN]
         if can_draw(report):

@@ -45,7 +45,7 @@ def selftest(
     from slipid.lab.selftest.experiment import selftest as run
     from slipid.report.checks import show_selftest
 
-    with Reporter(quiet=quiet) as report, locked(out, "selftest"):
+    with Reporter(quiet=quiet) as report, locked(out, "selftest", "selftest.json"):
         found = run(config, data, out, replicates, seed, report)
     files = ("selftest.json", "replicates.json")
     step = Next("drive it, and check the logs", ("check", config, "--data", data or "logs"))

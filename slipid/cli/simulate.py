@@ -28,7 +28,11 @@ def simulate(
     from slipid.support.toml_file import text_of
 
     plan = read(config, text_of(config))
-    with Reporter(quiet=quiet) as report, locked(out, "simulate"), executor_of(jobs) as executor:
+    with (
+        Reporter(quiet=quiet) as report,
+        locked(out, "simulate", "simulate.json"),
+        executor_of(jobs) as executor,
+    ):
         found = run(plan, out, executor, report)
     emit(json, found, lambda page: show(page, found, out), list(following(plan, out)))
     return 0

@@ -93,6 +93,7 @@ def track(
     from slipid.camera.frame_source import open_source
     from slipid.camera.overhead import OverheadCamera
     from slipid.camera.tracking import tracking
+    from slipid.camera.tracking.outputs import check_writable
     from slipid.camera.tracking.target import read_targets
     from slipid.support.errors import DataError
 
@@ -113,6 +114,8 @@ def track(
             yaw = math.radians(marker_yaw)
             lone = tracking.LoneMarker(marker_size, marker_height, id, dictionary, yaw)
             bodies = (lone.target(frames, report, part),)
+        for file in tracking.pose_files(out, bodies):
+            check_writable(file)
         unfinished = out.with_name(f".{out.name}.unfinished")
         with locked(unfinished, "track"):
             result = tracking.track(frames, above, bodies, unfinished, report, part)

@@ -89,7 +89,11 @@ def trial(
         rest=rest,
         load=load,
     )
-    with Reporter(quiet=quiet) as report, locked(out, "trial"), executor_of(jobs) as executor:
+    with (
+        Reporter(quiet=quiet) as report,
+        locked(out, "trial", "trial.json", "trial.png"),
+        executor_of(jobs) as executor,
+    ):
         done = run(out, options, executor, report)
         written = ["trial.json"]
         if can_draw(report):

@@ -46,7 +46,7 @@ def validate(
     """
     from slipid.report.answers import show_validation
 
-    with Reporter(quiet=quiet) as report, locked(out, "validate"):
+    with Reporter(quiet=quiet) as report, locked(out, "validate", "validation.json"):
         found, written = run(out, data, report, logs)
     emit(json, found, lambda page: show_validation(page, found), [renew(out)], out, written)
     return 0
@@ -97,7 +97,7 @@ def compare(
     from slipid.app.compare import compare as run
     from slipid.report.answers import show_comparison
 
-    with Reporter(quiet=quiet) as report, locked(out, "compare"):
+    with Reporter(quiet=quiet) as report, locked(out, "compare", "comparison.json"):
         found = run(config, data, out, folds.replace(" ", "").split(","), report)
         written = ["comparison.json"]
         if can_draw(report):

@@ -6,10 +6,13 @@ are deleted, see `files_of_fit`; thus what a killed command leaves is incomplete
 """
 
 from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
 
+from slipid.infer.result_content import RunContent, checked_result
 from slipid.support.errors import DataError
 from slipid.support.files import read_json
+from slipid.support.toml_file import text_of
 
 FIT, IDENTIFIED, RUN, CONFIG, ROBOT = (
     *("fit.json", "identified.json", "run.json", "config.toml", "robot.json"),
@@ -28,6 +31,8 @@ OF_FIT = (
 run.json and the copy of the config.
 
 They are deleted in this order. The last one shows that the folder has a result."""
+WRITTEN = (FIT, RUN, *OF_FIT)
+"""Names of the files that `slipid identify` and later commands write to a result folder."""
 _AGAIN = "run `slipid identify` again"
 
 
@@ -90,6 +95,50 @@ def refuse_other_fit(folder: Path, path: Path, fit: object) -> None:
     """
     if fit is not None and fit != fit_of(folder):
         raise DataError(f"{path}: of a different fit than the one in {folder}; {_AGAIN}")
+
+
+def config_text(folder: Path) -> str:
+    """Return the text of the config in a result folder.
+
+    Raises:
+        DataError: the config or run.json is absent, or the config was changed since the fit.
+    """
+    path = folder / CONFIG
+    text = text_of(path)
+    if sha256(text.encode()).hexdigest() != _hash_of_config(folder):
+        raise DataError(
+            f"{path}: not the config of the fit, whose SHA-256 is in {RUN}; expected this file "
+            "unchanged, since results depend on it. To use a changed config, copy it and run "
+            "`slipid identify` with it"
+        )
+    return text
+
+
+def refuse_foreign_config(folder: Path, text: str) -> None:
+    """Raise `DataError` if a folder has a config that a fit would overwrite and that is no copy.
+
+    Args:
+        folder: the result folder.
+        text: text of the config to be copied to it.
+    """
+    path = folder / CONFIG
+    if not path.is_file() or (found := text_of(path)) == text:
+        return
+    if (folder / RUN).exists():
+        copied = _hash_of_config(folder) == sha256(found.encode()).hexdigest()
+    else:  # the writing of a fit was interrupted
+        copied = any((folder / name).exists() for name in (FIT, IDENTIFIED))
+    if not copied:
+        raise DataError(
+            f"{path}: no copy that slipid made for a fit, or changed since, and would be "
+            "overwritten; expected a different folder (or move the file away)"
+        )
+
+
+def _hash_of_config(folder: Path) -> str:
+    """Return the SHA-256 of the config of a fit, as in run.json."""
+    content = read_json(folder / RUN, "the run.json that `slipid identify` writes")
+    return checked_result(folder / RUN, content, RunContent).config.sha256
 
 
 def _under(path: Path, key: str) -> object:

@@ -58,7 +58,7 @@ def plain(axes: Axes) -> None:
 def png(made: Figure) -> bytes:
     """Return the figure as the bytes of a PNG file."""
     buffer = io.BytesIO()
-    made.savefig(buffer, format="png", dpi=110)
+    made.savefig(buffer, format="png", dpi=110, metadata={"Software": "slipid"})
     return buffer.getvalue()
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from slipid.support.errors import DataError
-from slipid.support.folder import temporary_of
+from slipid.support.folder import MARKED, MARKS, refuse_foreign, temporary_of
 from slipid.support.parsing import MOST_ARRAY_BYTES, arrays_of, json_of
 
 PIPE = "a pipe or a device; save it to a file first"
@@ -32,7 +32,8 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_together(content: Mapping[Path, bytes], outdated: Iterable[Path] = ()) -> None:
     """Write several files, each atomically, after all of them fit on the disk.
 
-    If a file cannot be written, all old files stay as they are. Otherwise outdated files are
+    A file of a marked kind (see `MARKS`) only replaces a file with the same mark. If a file cannot
+    be written, all old files stay as they are. Otherwise outdated files are
     deleted, except links through which a file is written, and the new files then appear in the
     given order. If the process is killed in between, the last file is thus missing if it was among
     the outdated ones.
@@ -53,6 +54,9 @@ def write_together(content: Mapping[Path, bytes], outdated: Iterable[Path] = ())
     try:
         for path, data in content.items():
             target = target_of(path)
+            for mark in MARKS.values():
+                if mark in data[:MARKED]:
+                    refuse_foreign(path, mark)
             target.parent.mkdir(parents=True, exist_ok=True)
             temporary[target] = temporary_of(target)
             with temporary[target].open("xb") as file:

@@ -1,4 +1,4 @@
-"""Folders that commands write to: a lock for one writer at a time, and leftovers of killed ones."""
+"""Folders that commands write to: one writer at a time, leftovers of killed ones, foreign files."""
 
 import os
 import re
@@ -15,6 +15,15 @@ LOCK = ".slipid.lock"
 """Name of the file that the writer of a folder locks; it names the writer."""
 MOST_NAME_BYTES = 200
 """Largest number of bytes of a file's name that its temporary name repeats."""
+MARKS = {
+    ".json": b'"slipid.',
+    ".html": b'<meta name="generator" content="slipid">',
+    ".png": b"Software\0slipid",
+    ".mcap": b"\0\0\0slipid ",
+}
+"""Bytes by which a file of slipid is recognised, keyed by the ending of its usual name."""
+MARKED = 4096
+"""Number of bytes at the beginning and at the end of a file that are searched for its mark."""
 
 
 def temporary_of(path: Path) -> Path:
@@ -32,8 +41,29 @@ def name_of_temporary(name: str) -> str | None:
     return None if match is None else match[1] + match[2]
 
 
+def refuse_foreign(path: Path, mark: bytes | None = None) -> None:
+    """Raise `DataError` if a file exists that slipid did not write, and would thus be lost.
+
+    Args:
+        path: the file to write, which may be absent or empty.
+        mark: bytes at the beginning or the end of the files of slipid; those for the ending of the
+            path by default. Files with an ending that has no mark are not checked.
+    """
+    mark = MARKS.get(path.suffix) if mark is None else mark
+    if mark is None or not path.is_file():
+        return
+    with suppress(OSError), path.open("rb") as file:  # not readable: an error when it is written
+        found = file.read(MARKED)
+        file.seek(max(0, path.stat().st_size - MARKED))
+        if found and mark not in found and mark not in file.read():
+            raise DataError(
+                f"{path}: exists and was not written by slipid, and would be overwritten; expected "
+                "a new name or folder (or move the file away)"
+            )
+
+
 @contextmanager
-def locked(folder: Path | None, command: str) -> Iterator[None]:
+def locked(folder: Path | None, command: str, *names: str) -> Iterator[None]:
     """Return a context in which no other command of slipid writes to a folder.
 
     The folder is made if necessary. Temporary files that killed commands left in it are deleted.
@@ -43,14 +73,17 @@ def locked(folder: Path | None, command: str) -> Iterator[None]:
     Args:
         folder: the folder; None for a command that writes to none.
         command: name of the command, for the message to others.
+        names: names of files that the command will write, among others.
 
     Raises:
-        DataError: a different process has the lock, which the message names, or the folder cannot
-            be written.
+        DataError: a different process has the lock, which the message names, the folder cannot be
+            written, or a file that slipid did not write has one of the names.
     """
     if folder is None:
         yield
         return
+    for name in names:
+        refuse_foreign(folder / name)
     if not HAS_LOCKS:
         _remove_leftovers(folder)
         yield

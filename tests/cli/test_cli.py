@@ -316,11 +316,55 @@ def test_json_overwrites_no_file_that_is_not_the_json_of_a_result(tmp_path, cont
     assert "mine: a file that is no JSON of an earlier result, and would be" in result.stderr
     assert path.read_text() == content
     result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", tmp_path / "a.toml")
-    assert "a.toml: the file of a different option" in result.stderr
+    assert "a.toml': also the file of the option config" in result.stderr
     path.write_text('{"schema": "slipid.check/1"}')
     result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", path)
     assert "a.toml" in result.stderr
     assert "--json" not in result.stderr
+
+
+@pytest.mark.slow
+def test_files_of_the_user_and_logs_are_kept(small, tmp_path):
+    folder, _ = small
+    logs = folder / "logs"
+    log = next(logs.rglob("*.csv"))
+    name = log.relative_to(logs).as_posix()
+    before = log.read_bytes()
+    fit = ("identify", folder / "my.toml", "--data", logs, "--quiet", "--out")
+    own = tmp_path / "own"
+    own.mkdir()
+    for file in ("config.toml", "robot.json", "report.html"):
+        (own / file).write_text("[1, 2]")
+        words = ("--data", logs, "--out", own)
+        commands = [(*fit, own)] + [("check", folder / "my.toml", *words)] * (file[:3] == "rep")
+        for command in commands:
+            result = invoke(*command)
+            assert result.exit_code == 2
+            assert f"{own / file}: " in result.stderr
+            assert "overwritten" in result.stderr
+        assert [p.name for p in own.iterdir()] == [file]
+        (own / file).unlink()
+    result = invoke("export-run", folder / "out", name, "--out", log)
+    assert result.exit_code == 2
+    assert f"{log}: exists and was not written by slipid" in result.stderr
+    assert log.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_changed_config_is_not_that_of_the_fit(small, tmp_path):
+    folder, _ = small
+    out = tmp_path / "out"
+    shutil.copytree(folder / "out", out)
+    config = out / "config.toml"
+    config.write_text(config.read_text() + "# mine\n")
+    for words in (("report",), ("sample",), ("validate", "--data", folder / "unseen")):
+        result = invoke(*words, out)
+        assert result.exit_code == 2
+        assert "config.toml: not the config of the fit" in result.stderr
+    again = invoke("identify", folder / "my.toml", "--data", folder / "logs", "--out", out)
+    assert again.exit_code == 2
+    assert "config.toml: no copy that slipid made for a fit, or changed since" in again.stderr
+    assert config.read_text().endswith("# mine\n")
 
 
 @pytest.mark.slow

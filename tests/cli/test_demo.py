@@ -24,6 +24,7 @@ from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
 from tests.helpers.golden_rows import of_identified, of_validation
 from tests.helpers.recording import pack
+from tests.helpers.shared import invoke
 
 
 def test_the_recording_holds_logs_and_truth(tmp_path):
@@ -35,6 +36,15 @@ def test_the_recording_holds_logs_and_truth(tmp_path):
         assert f"{part}/truth/truth.json" in files
     assert len(files) == 84 + 36 + 2
     assert RECORDED.stat().st_size < 1_000_000
+
+
+def test_an_edited_config_is_kept(tmp_path):
+    config = tmp_path / "robotino.toml"
+    config.write_text("mine")
+    result = invoke("demo", "--out", tmp_path)
+    assert result.exit_code == 2
+    assert "robotino.toml: differs from the config of the demo" in result.stderr
+    assert (config.read_text(), len(list(tmp_path.iterdir()))) == ("mine", 1)
 
 
 def test_packing_what_was_unpacked_gives_the_same_bytes(tmp_path):

@@ -10,12 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipid.app.floors import _run_floors, summary
+from slipid.app.floors import _run_floors, summary, write_floors
 from slipid.data.floor_map import from_polygons, write_map
 from slipid.data.log import Log
 from slipid.deploy.floors import FloorLookup
 from slipid.model.geometry import omni
 from slipid.model.robot import build
+from slipid.support.errors import DataError
 from tests.helpers.shared import invoke
 
 EDGE = 0.1
@@ -70,6 +71,12 @@ def test_a_marker_that_sits_aside_and_is_turned_is_taken_into_account(tmp_path):
     assert shares["beyond_the_map"] == pytest.approx(0.5)
     on_map = [sum(part) for part in zip(*shares["runs"]["run.csv"].values(), strict=True)]
     assert on_map == pytest.approx([1.0, 0.5, 0.0])
+    for _ in range(2):  # an earlier result is replaced
+        (path,) = write_floors(tmp_path, lookup, [beyond])
+    path.write_text("time,ticks_1\n0.0,1\n")
+    with pytest.raises(DataError, match=r"run\.csv: exists and was not written by slipid"):
+        write_floors(tmp_path, lookup, [beyond])
+    assert path.read_text() == "time,ticks_1\n0.0,1\n"
 
 
 @pytest.mark.slow

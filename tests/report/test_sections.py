@@ -20,6 +20,7 @@ from slipid.report.html.later_content import COMMANDS, LATER
 from slipid.report.html.results import read_results
 from slipid.report.html.sections.predictions import _played
 from slipid.support.errors import DataError
+from tests.helpers import later_files
 
 
 def value(x, half, verdict="identified", unit="m"):
@@ -27,6 +28,7 @@ def value(x, half, verdict="identified", unit="m"):
     return {"value": x, "interval90": interval, "std": half / 1.6, "verdict": verdict, "unit": unit}
 
 
+CONFIG = b'[robot]\ndrive = "differential"\n'
 CALIBRATION = {
     "surfaces": {
         "wood": {
@@ -95,7 +97,7 @@ def folder(tmp_path):
         "schema": "slipid.run/1",
         "finished": "2026-01-01T00:00:00+00:00",
         "seconds": 9.0,
-        "config": {"name": "robot.toml", "sha256": "cd" * 32},
+        "config": {"name": "robot.toml", "sha256": hashlib.sha256(CONFIG).hexdigest()},
         "data": {"folder": "logs", "hash": "ab" * 32, "logs": {"wood/0.csv": "e"}, "skipped": []},
         "versions": {"slipid": "0"},
     }
@@ -115,7 +117,7 @@ def folder(tmp_path):
     }
     for name, content in (("identified", identified), ("run", run), ("fit", fit)):
         (tmp_path / f"{name}.json").write_text(json.dumps(content))
-    (tmp_path / "config.toml").write_text('[robot]\ndrive = "differential"\n')
+    (tmp_path / "config.toml").write_bytes(CONFIG)
     (tmp_path / "robot.json").write_text("{}")
     return tmp_path
 
@@ -316,6 +318,16 @@ def test_errors_stand_beside_those_of_every_simpler_model(folder):
         "force balance",
     ]
     assert table.rows[2][3] == "+1.60 ± 3.29"
+
+
+def test_a_trial_of_few_starts_has_no_intervals(folder):
+    row = later_files.LATER["trial"]["summary"]["encoder"]
+    few = row | {"interval90": dict.fromkeys(row["interval90"])}
+    for summary, words in ((row, "with 90 % intervals"), (few, "too few for intervals")):
+        content = later_files.LATER["trial"] | {"summary": {"encoder": summary}}
+        (folder / "trial.json").write_text(json.dumps(content))
+        figure, _ = page_of(folder)["trial"]
+        assert words in figure.caption
 
 
 def test_a_page_has_no_section_without_content(folder):

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from slipid.support.errors import DataError
-from slipid.support.folder import LOCK, locked, name_of_temporary, temporary_of
+from slipid.support.files import write_bytes
+from slipid.support.folder import LOCK, MARKS, locked, name_of_temporary, temporary_of
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no flock")
 
@@ -108,3 +109,23 @@ def test_where_locks_are_not_supported_work_goes_on(tmp_path, monkeypatch):
     with locked(tmp_path, "identify"), locked(tmp_path, "sample"):
         (tmp_path / "result").touch()
     assert [p.name for p in tmp_path.iterdir()] == ["result"]
+
+
+@pytest.mark.parametrize("suffix", MARKS)
+def test_a_file_that_slipid_did_not_write_is_kept(tmp_path, suffix):
+    path = tmp_path / f"mine{suffix}"
+    new = b"{" + MARKS[suffix] + b"new"
+    for content in (b"", new, MARKS[suffix] + b"damaged"):  # may be replaced
+        path.write_bytes(content)
+        write_bytes(path, new)
+        assert path.read_bytes() == new
+    path.write_bytes(b"photo")
+    with pytest.raises(DataError, match=r"mine.*: exists and was not written by slipid"):
+        write_bytes(path, new)
+    with (
+        pytest.raises(DataError, match=r"mine.*: exists and was not written by slipid"),
+        locked(tmp_path, "check", path.name),
+    ):
+        pass
+    assert path.read_bytes() == b"photo"
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]

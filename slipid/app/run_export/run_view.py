@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.app.calibrate import read_calibration
-from slipid.app.config import Config, LogsSection, read_config, shape_of
+from slipid.app.config import Config, LogsSection, shape_of
 from slipid.app.floor_maps import map_path
-from slipid.app.logs import matching_files, read_dataset, read_run_file
+from slipid.app.logs import config_of_fit, matching_files, read_dataset, read_run_file
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
@@ -89,7 +89,7 @@ def run_view(
     """
     about = read_run_file(out).data
     fitted = about.logs
-    config, root = read_config(out / "config.toml"), Path(about.folder) if data is None else data
+    config, root = config_of_fit(out), Path(about.folder) if data is None else data
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
     name = _name_of(wanted, list(fitted), root, out)

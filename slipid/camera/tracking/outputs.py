@@ -8,6 +8,8 @@ size of the markers divided by the true size [1]; rejected_x, rejected_y [m], re
 """
 
 import io
+import struct
+import zlib
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -21,6 +23,7 @@ from slipid.camera.tracking.track import Flag, TrackedPoses
 from slipid.support.errors import DataError
 from slipid.support.extras import require
 from slipid.support.files import writable, write_bytes
+from slipid.support.folder import MARKS, refuse_foreign
 
 _FORMATS = {
     **dict.fromkeys(("time", "x", "y", "heading"), "%.6f"),
@@ -31,14 +34,16 @@ _FORMATS = {
 }
 """Number format in CSV of each column except frame and flag."""
 _HEAD = ",".join(["frame", *_FORMATS, "flag"])
+_PARQUET_MARK = "slipid.poses"
+_PICTURE_MARK = MARKS[".png"]
 
 
 def check_writable(path: Path) -> None:
     """Raise `DataError` unless poses can be written to a file.
 
     Raises:
-        DataError: the file cannot be written, would replace a CSV file that holds no tracked poses,
-            or is Parquet and pyarrow is not installed.
+        DataError: the file cannot be written, would replace a file that holds no tracked poses, or
+            is Parquet and pyarrow is not installed.
     """
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -47,14 +52,7 @@ def check_writable(path: Path) -> None:
         raise DataError(
             f"{path}: not a name for a file of poses; expected one that ends in .csv or .parquet"
         )
-    if suffix == ".csv" and path.is_file():
-        with path.open("rb") as file:
-            head = file.read(len(_HEAD))
-        if head not in (b"", _HEAD.encode()):
-            raise DataError(
-                f"{path}: this file holds no tracked poses and would be overwritten; expected "
-                "another name"
-            )
+    refuse_foreign(path, (_HEAD if suffix == ".csv" else _PARQUET_MARK).encode())
     if suffix == ".parquet":
         _pyarrow()
     writable(path.parent)
@@ -107,7 +105,7 @@ def _parquet(track: TrackedPoses) -> bytes:
     }
     table = pa.table({"frame": track.frame, **columns, "flag": _flags(track)})
     out = io.BytesIO()
-    pa.parquet.write_table(table, out)
+    pa.parquet.write_table(table.replace_schema_metadata({"schema": _PARQUET_MARK}), out)
     return out.getvalue()
 
 
@@ -153,20 +151,22 @@ def check_drawable(path: Path) -> None:
         DataError: the file cannot be written, or the suffix is not that of an image.
     """
     _encoded(path, np.zeros((8, 8, 3), np.uint8))
+    refuse_foreign(path, _PICTURE_MARK)
     writable(path.parent)
 
 
 def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
-    try:
-        there, data = cv2.imencode(path.suffix or ".", drawn)
-    except cv2.error:
-        there = False
-    if not there:
-        raise DataError(
-            f"{path}: OpenCV writes no image with this suffix; expected a name that ends in .png "
-            "or .jpg"
-        )
-    return bytes(data)
+    """Return a picture as PNG or JPEG with the mark of slipid's pictures in it."""
+    suffix, mark = path.suffix.lower(), _PICTURE_MARK
+    if suffix not in (".png", ".jpg", ".jpeg"):
+        raise DataError(f"{path}: not a name for a picture; expected one that ends in .png or .jpg")
+    data = bytes(cv2.imencode(suffix, drawn)[1])
+    if suffix == ".png":  # a chunk of text behind the signature and the header
+        text = b"tEXt" + mark
+        parts = struct.pack(">I", len(mark)), text, struct.pack(">I", zlib.crc32(text))
+        return data[:33] + b"".join(parts) + data[33:]
+    # a comment behind the marker of the picture's begin
+    return data[:2] + b"\xff\xfe" + struct.pack(">H", len(mark) + 2) + mark + data[2:]
 
 
 def _line(

@@ -1,5 +1,6 @@
 """`slipid track`: poses of marked bodies from a video, a folder of images or a camera."""
 
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,9 +53,7 @@ class TrackingResult:
 
         If there are several bodies, each one gets its own file, whose name ends in the body's name.
         """
-        names = [path]
-        if len(self.tracks) > 1:
-            names = [path.with_stem(f"{path.stem}_{t.target.name}") for t in self.tracks]
+        names = pose_files(path, [track.target for track in self.tracks])
         for name, track in zip(names, self.tracks, strict=True):
             write_poses(name, track)
         self.checkpoint.remove()
@@ -137,6 +136,13 @@ def track(
         (*doubts, *(doubt for track in tracks for doubt in track.doubts())),
         kept,
     )
+
+
+def pose_files(path: Path, bodies: Sequence[Target]) -> list[Path]:
+    """Return the file of poses for each body: the path itself if there is only one body."""
+    if len(bodies) == 1:
+        return [path]
+    return [path.with_stem(f"{path.stem}_{body.name}") for body in bodies]
 
 
 def check_outputs(source: FrameSource, out: Path, preview: Path | None) -> None:

@@ -117,6 +117,8 @@ MANIFEST = "simulate.json"
 SCHEMA = "slipid.simulation/1"
 FOLDERS = {"slipid": "logs", "robotino2022": "robotino2022"}
 """Name of the folder of each log format, in the output folder."""
+WRITTEN = (*FOLDERS.values(), "truth", "maps", "video", "robot.toml", "robot_video.toml")
+"""Names of what a simulation writes besides its manifest."""
 TRUTH_STEP = 10
 """Number of time steps from one row of the stored truth to the next."""
 
@@ -154,6 +156,11 @@ def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Report
                     f"{out}: contains runs with another {what}; expected an empty folder or the "
                     f"same {what}"
                 )
+    elif there := [name for name in WRITTEN if (out / name).exists()]:
+        raise DataError(
+            f"{out / there[0]}: not of a simulation, since {MANIFEST} is missing beside it; "
+            "expected an empty or new folder (--out)"
+        )
     write_json(manifest, about)
     _write_truth(plan, out)
     formats = tuple(plan.content.formats)

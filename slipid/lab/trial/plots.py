@@ -132,8 +132,7 @@ def _bars(axes: Axes, table: Content, key: str, label: str) -> None:
     axes.barh(at, value, color="#9bb8cf", height=0.7)
     axes.hlines(at, low, high, color=INK, lw=1.2)
     axes.set_yticks(at, names, fontsize=8)
-    axes.set_xlabel(
-        f"{label}\nmedian of {table[names[0]]['runs']} starts, 90 % interval", fontsize=8
-    )
+    intervals = ", 90 % interval" if np.isfinite(low).any() else ""
+    axes.set_xlabel(f"{label}\nmedian of {table[names[0]]['runs']} starts{intervals}", fontsize=8)
     axes.tick_params(axis="x", labelsize=8, color=SHADE)
     plain(axes)

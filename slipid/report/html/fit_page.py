@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from slipid.app.calibrate import CalibrationResult
-from slipid.app.config import read_config
-from slipid.app.logs import log_folder
+from slipid.app.logs import config_of_fit, log_folder
 from slipid.app.problem import FitTask, read_fit_task
 from slipid.infer.fit_file import load
 from slipid.infer.motion_models import MotionModels
@@ -123,7 +122,7 @@ def renew(out: Path, logs: Path | None, report: Reporter) -> Path:
         setup_jax(quiet=True)
         fit = load(out)
         folder = log_folder(out, logs)
-        task = read_fit_task(read_config(out / "config.toml"), folder, report)
+        task = read_fit_task(config_of_fit(out), folder, report)
         report.stage("gathering what the page shows")
         found = evidence_of_fit(fit, task.dataset, tell=report.steps)
         if any(section.map for section in task.config.content.logs):

@@ -147,9 +147,9 @@ class TrialRowContent:
     interval90: dict[str, Pair | None]
 
     def __post_init__(self) -> None:
-        """Raise `ValueError` if the median has no interval."""
-        if self.interval90.get("closure_error_median") is None:
-            raise ValueError("closure_error_median has no interval")
+        """Raise `ValueError` if the key of the median's interval is missing."""
+        if "closure_error_median" not in self.interval90:
+            raise ValueError("interval90 lacks closure_error_median")
 
 
 @dataclass(frozen=True, config=OPEN)

@@ -9,13 +9,20 @@ from typing import Any
 import numpy as np
 
 from slipid.infer.result_content import AGAIN, IdentifiedContent, RunContent, checked_result
-from slipid.infer.result_folder import FIT, IDENTIFIED, fit_of, refuse_other_fit
+from slipid.infer.result_folder import (
+    CONFIG,
+    FIT,
+    IDENTIFIED,
+    config_text,
+    fit_of,
+    refuse_other_fit,
+)
 from slipid.report.html.evidence import EVIDENCE, FitEvidence, read_evidence
 from slipid.report.html.later_content import COMMANDS, LATER, ShownFitContent
 from slipid.support.content import Content
 from slipid.support.errors import DataError, bad_data, refused_as
 from slipid.support.files import read_bytes, read_json
-from slipid.support.toml_file import mapping_of, text_of
+from slipid.support.toml_file import mapping_of
 
 RESULT = "a result of `slipid identify`"
 DRAWS = "posterior.nc"
@@ -122,7 +129,7 @@ def read_results(out: Path) -> Results:
     later = {name: None if name in outdated else _later(out, name) for name in LATER}
     return Results(
         folder=out,
-        drive=_drive(out / "config.toml"),
+        drive=_drive(out),
         identified=identified,
         run=run,
         fit=_maybe(out / FIT, ShownFitContent, AGAIN),
@@ -135,9 +142,9 @@ def read_results(out: Path) -> Results:
     )
 
 
-def _drive(config: Path) -> str:
-    """Return the type of wheels in a config; empty if it names none."""
-    robot = mapping_of(config, text_of(config)).get("robot")
+def _drive(out: Path) -> str:
+    """Return the type of wheels in the config of a fit; empty if it names none."""
+    robot = mapping_of(out / CONFIG, config_text(out)).get("robot")
     return str(robot.get("drive", "")) if isinstance(robot, dict) else ""
 
 

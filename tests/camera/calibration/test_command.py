@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -110,6 +111,19 @@ def test_command_makes_a_camera_without_calibration(folder, tmp_path):
     camera = OverheadCamera.load(out)
     assert camera.lens.image_px == SIZE
     np.testing.assert_allclose(camera.pixels(np.array([0.4, 0, 0])), [219.5, 239.5], atol=1e-9)
+
+
+def test_neither_a_picture_nor_the_lens_is_overwritten(folder, camera_file, tmp_path):
+    own, lens = tmp_path / "own.png", tmp_path / "lens.json"
+    shutil.copy(folder / "empty.png", own)
+    shutil.copy(camera_file[0], lens)
+    described = ("--metres-per-pixel", 0.004, "--lens-height", 2.4)
+    done = invoke("calibrate", own, *described, "--out", own)
+    assert (done.exit_code, own.read_bytes()) == (2, (folder / "empty.png").read_bytes())
+    assert "own.png: exists and was not written by slipid" in done.stderr
+    done = invoke("calibrate", "--camera", lens, "--points", tmp_path / "p.csv", "--out", lens)
+    assert (done.exit_code, lens.read_bytes()) == (2, camera_file[0].read_bytes())
+    assert "also the file of the option" in done.stderr
 
 
 def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):

@@ -57,12 +57,18 @@ def test_poses_are_written_as_csv_and_parquet(made, tmp_path):
     assert (content["schema"], content["frames"]) == ("slipid.track/1", COUNT)
     assert content["targets"]["robot"]["flags"]["ok"] == COUNT
     assert content["targets"]["robot"]["height_told_m"] == pytest.approx(0.25, abs=0.02)
-    assert track(made, video, tmp_path / "poses.parquet", *LONE).exit_code == 0
+    photo = tmp_path / "look.jpg"
+    again = track(made, video, tmp_path / "poses.csv", *LONE, "--preview", picture)
+    assert again.exit_code == 0, again.stderr
+    for _ in range(2):  # slipid's own files are replaced
+        done = track(made, video, tmp_path / "poses.parquet", *LONE, "--preview", photo)
+        assert done.exit_code == 0, done.stderr
+    assert cv2.imread(str(photo)).shape == (270, 480, 3)
     other = pd.read_parquet(tmp_path / "poses.parquet")
     assert list(other.columns) == list(table.columns)
     pd.testing.assert_frame_equal(other, table, check_dtype=False, rtol=1e-3, atol=1e-6)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(
-        ["look.png", "poses.csv", "poses.parquet", "shown.json"]
+        ["look.jpg", "look.png", "poses.csv", "poses.parquet", "shown.json"]
     )
 
 

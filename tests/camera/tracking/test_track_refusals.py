@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -116,6 +117,13 @@ def test_no_file_of_another_kind_is_lost(made, tmp_path):
     log.write_text("time,ticks_1\n0.0,1\n")
     video = made.video("robot", ROBOT)
     assert "would be overwritten" in refusal(made, video, *LONE, out=log)
+    for name in ("run07.parquet", "photo.jpg", "photo.png"):
+        foreign = tmp_path / name
+        shutil.copy(log, foreign)
+        out, more = (foreign, ()) if "run" in name else (None, ("--preview", foreign))
+        found = refusal(made, video, *LONE, *more, out=out)
+        assert f"{name}: exists and was not written by slipid" in found
+        assert foreign.read_text() == log.read_text()
     assert log.read_text() == "time,ticks_1\n0.0,1\n"
     assert ".csv or .parquet" in refusal(made, video, *LONE, out=tmp_path / "a.xlsx")
     assert not (tmp_path / "a.xlsx").exists()
@@ -169,7 +177,7 @@ def test_unwritable_files_are_reported_before_the_work(made, tmp_path, monkeypat
     words = (*LONE, "--id", 0)
     assert "cannot be written" in refusal(made, video, *words, out=tmp_path / "file" / "p.csv")
     assert "a folder; expected the name" in refusal(made, video, *words, out=tmp_path)
-    assert "a name that ends in .png or .jpg" in refusal(
+    assert "expected one that ends in .png or .jpg" in refusal(
         made, video, *words, "--preview", tmp_path / "p.docx"
     )
     blocked = tmp_path / "file" / "p.png"

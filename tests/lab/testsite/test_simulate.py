@@ -84,6 +84,13 @@ def sums(folder):
     return {p.relative_to(folder): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
+def test_a_folder_with_logs_of_other_origin_is_refused(config, tmp_path):
+    (tmp_path / "logs").mkdir()
+    with pytest.raises(DataError, match=r"logs: not of a simulation"):
+        quietly(config, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["logs", "site.toml"]
+
+
 @pytest.mark.slow
 def test_the_same_seed_writes_the_same_bytes_with_any_number_of_processes(config, tmp_path):
     found = quietly(config, tmp_path / "one")

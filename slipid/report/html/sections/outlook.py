@@ -25,7 +25,7 @@ def trial(found: Results) -> PageSection | None:
     for k, name in enumerate(names):
         row = t["summary"][name]
         middle = row["closure_error_median"]
-        low, high = row["interval90"]["closure_error_median"]
+        low, high = row["interval90"]["closure_error_median"] or (middle, middle)
         shade = "@orange" if name == "encoder" else draw.SERIES[0]
         hover = "%{x:.0f} mm<extra>%{fullData.name}</extra>"
         spread = [middle - low], [high - middle]
@@ -38,10 +38,12 @@ def trial(found: Results) -> PageSection | None:
         "yaxis": {"automargin": True, "tickvals": list(range(len(names))), "ticktext": names},
         "showlegend": False,
     }
-    runs = min(row["runs"] for row in t["summary"].values())
+    summaries = t["summary"].values()
+    runs = min(row["runs"] for row in summaries)
+    known = all(row["interval90"]["closure_error_median"] for row in summaries)
+    intervals = "with 90 % intervals" if known else "too few for intervals"
     caption = (
-        f"Medians of {runs} starts, with 90 % intervals; path '{t['path']}' at "
-        f"{t['speed_m_s']:g} m/s."
+        f"Medians of {runs} starts, {intervals}; path '{t['path']}' at {t['speed_m_s']:g} m/s."
     )
     figure = FigureBlock("trial_errors", title, title, data, layout, caption, 130 + 34 * len(names))
     rows = [
