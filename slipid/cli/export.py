@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from slipid.cli.common import Json, Load, Next, Quiet, emit, flag, for_robots, option
+from slipid.support.content import Content
 from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
@@ -75,7 +76,8 @@ def export(
             from slipid.exports.stablehlo import load_program
 
             load_program(source / "stablehlo")
-        found = {"folder": str(source), "files": list(names), "intact": True}
+        found: Content = {"schema": "slipid.export_check/1", "folder": str(source)}
+        found |= {"files": list(names), "intact": True}
         intact = f"{source}: all {len(names)} files are unchanged"
         emit(json, found, lambda page: page.line(intact), [])
         return 0

@@ -18,6 +18,7 @@ from slipid.data.geojson_map import MapRegion, Patch, VectorMap
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 
+SCHEMA = "slipid.map_result/1"
 HARDLY_DISTINCT, NOT_DISTINCT = 5.0, 3.5
 """Differences of appearance below which two surfaces are reported as hard to distinguish, and as
 indistinguishable [spreads within a surface].
@@ -79,6 +80,7 @@ class PictureMap:
                 }
             )
         return {
+            "schema": SCHEMA,
             "surfaces": surfaces,
             "filled_share": self.vector.region.unknown_share,
             "robots": [{"marker": r.marker, "place_m": [r.x, r.y]} for r in self.robots],
