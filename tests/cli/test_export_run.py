@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import sys
@@ -284,6 +285,9 @@ def test_a_run_over_several_floors_is_drawn_on_its_map(small, tmp_path):
     more = '[[logs]]\nglob = "site/*.csv"\nformat = "demo"\nmap = "site.toml"\n'
     text = (out / "config.toml").read_text().replace("[parameters]", f"{more}\n[parameters]", 1)
     (out / "config.toml").write_text(text)
+    about = json.loads((out / "run.json").read_text())
+    about["config"]["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    (out / "run.json").write_text(json.dumps(about))
     words = ("--data", data)
     found = exported(out, "site/run.csv", tmp_path, *words)
     assert "site.toml: no such floor map; name it by --map" in found.about["notes"]
