@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, shown
 
 HAS_LOCKS = os.name == "posix"
 """True if the system has locks that end with their process."""
@@ -113,7 +113,8 @@ def _locked_file(folder: Path, owner: str) -> int:
             folder.mkdir(parents=True, exist_ok=True)
             lock = _opened(path)
         except OSError as error:
-            found = "a file" if folder.is_file() else f"cannot be written ({error.strerror})"
+            reason = _obstacle(folder, error)
+            found = "a file" if folder.is_file() else f"cannot be written ({reason})"
             raise DataError(f"{folder}: {found}; expected a writable folder") from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -140,9 +141,20 @@ def _opened(path: Path) -> int:
     """Return the descriptor of a lock file, which is made if necessary."""
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    except PermissionError:
+    except PermissionError as error:
         # a different user's file, left by a killed command, can be locked without writing to it
-        return os.open(path, os.O_RDONLY)
+        try:
+            return os.open(path, os.O_RDONLY)
+        except FileNotFoundError:
+            raise error from None
+
+
+def _obstacle(path: Path, error: OSError) -> str:
+    """Return why a path cannot be written, which for links that lead nowhere no system explains."""
+    for above in (path, *path.parents):
+        if above.is_symlink() and not os.path.exists(above):
+            return f"{shown(str(above))} is a link that leads nowhere"
+    return str(error.strerror or error)
 
 
 def _remove_leftovers(folder: Path) -> None:

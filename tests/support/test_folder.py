@@ -90,6 +90,25 @@ def test_a_lock_that_cannot_be_written_can_be_taken(tmp_path, monkeypatch):
         pass
 
 
+def test_a_folder_without_permission_and_links_that_lead_nowhere_say_so(tmp_path, monkeypatch):
+    (tmp_path / "dangling").symlink_to("nowhere")
+    (tmp_path / "loop").symlink_to("loop")
+    for name in ("dangling", "loop", "dangling/a", "loop/a"):
+        found = rf"cannot be written \('.*{name.partition('/')[0]}' is a link that leads nowhere\)"
+        with pytest.raises(DataError, match=found), locked(tmp_path / name, "design"):
+            pass
+    opened = os.open
+
+    def refused(path, flags, *mode):
+        if flags & os.O_CREAT:
+            raise PermissionError(13, "Permission denied")
+        return opened(path, flags, *mode)
+
+    monkeypatch.setattr(os, "open", refused)
+    with pytest.raises(DataError, match="Permission denied"), locked(tmp_path, "design"):
+        pass
+
+
 def test_a_file_is_no_folder(tmp_path):
     (tmp_path / "a.csv").touch()
     with (
