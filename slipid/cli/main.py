@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from slipid import __version__
+from slipid.cli.arguments import refuse_odd
 from slipid.cli.benchmark import benchmark, paper
 from slipid.cli.calibrate import calibrate
 from slipid.cli.check import check
@@ -35,6 +36,7 @@ from slipid.cli.simulate import simulate
 from slipid.cli.track import track
 from slipid.cli.trial import trial
 from slipid.cli.validate import compare, validate
+from slipid.support.errors import DataError
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -163,7 +165,21 @@ PANELS: dict[str, tuple[Command, ...]] = {
 
 
 class CommandHelp(TyperCommand):
-    """A command whose help lists its options in panels, as text that is not boxed."""
+    """A command whose help lists its options in panels, as text that is not boxed.
+
+    Its words are checked before they are converted, see `refuse_odd`.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given, *_ = self.make_parser(ctx).parse_args(args=list(args))
+        try:
+            if self.callback is not None and not ctx.resilient_parsing:
+                refuse_odd(self.callback, self.get_params(ctx), given)
+        except DataError as error:
+            typer.echo(str(error), err=True)
+            raise typer.Exit(2) from None
+        parsed: list[str] = super().parse_args(ctx, args)
+        return parsed
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         panels: dict[str, list[tuple[str, str]]] = {}

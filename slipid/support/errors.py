@@ -13,6 +13,7 @@ MOST_MISTAKES = 20
 _SHOWN = 60
 """Number of characters of the start, and of the end, of a long value in a message."""
 _LONG_WORD = re.compile(r"\S{81,}")
+_QUOTED = re.compile(r"(?<!\w)'[^'\n]*'")
 
 
 class DataError(ValueError):
@@ -34,12 +35,14 @@ class DataError(ValueError):
 def _bounded(message: str) -> str:
     """Return a printable message of at most `LONGEST` characters.
 
-    A longer one loses the middles of its long words, then its last lines, then its end.
+    A longer one loses the middles of its long words and quoted values, then its last lines, then
+    its end.
     """
     message = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
     if len(message) <= LONGEST:
         return message
-    message = _LONG_WORD.sub(lambda m: f"{m[0][:40]}...{m[0][-37:]}", message)
+    message = _QUOTED.sub(_shortened, message)
+    message = _LONG_WORD.sub(_shortened, message)
     lines = message.split("\n")
     for count in range(len(lines), 0, -1):
         more = f"\n... ({len(lines) - count} more)" if count < len(lines) else ""
@@ -47,6 +50,11 @@ def _bounded(message: str) -> str:
         if len(kept) <= LONGEST:
             return kept
     return f"{message[: LONGEST - 3]}..."
+
+
+def _shortened(found: re.Match[str]) -> str:
+    """Return a match without its middle if it is long."""
+    return found[0] if len(found[0]) <= 80 else f"{found[0][:40]}...{found[0][-37:]}"
 
 
 def bad_data(

@@ -16,6 +16,7 @@ import typer
 from slipid.cli import common
 from slipid.cli.common import Next, can_draw, emit, program
 from slipid.cli.main import app
+from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers.shared import invoke
 
@@ -49,6 +50,37 @@ def test_a_number_beyond_its_limits_is_refused(tmp_path, text, capsys):
         common.guarded(lambda **options: 0)(top_speed=math.nan)
     assert caught.value.exit_code == 2
     assert capsys.readouterr().err == "--top-speed: nan; expected a number\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("export", "fit", "--floors", ""), "--floors is empty; expected NAMES\n"),
+        (("trial", "fit", "--load", " "), "--load is empty; expected a name\n"),
+        (("check", "c.toml", "--data", ""), "--data is empty; expected a folder\n"),
+        (("demo", "--out="), "--out is empty; expected a folder\n"),
+        (("new", "--from", ""), "--from is empty; expected LOG\n"),
+        (("check", "", "--data", "d"), "CONFIG is empty; expected a value\n"),
+        (("design", "fit", "--floor", "a", "--floor", ""), "--floor is empty; expected a name\n"),
+        (("trial", "fit", "--speed", "-NaN"), "--speed: nan; expected a number\n"),
+        (
+            ("trial", "fit", "--controllers", "a\nb"),
+            "--controllers 'a\\nb'; expected a value without line breaks\n",
+        ),
+    ],
+)
+def test_odd_values_are_refused_in_a_sentence(words, message):
+    ended = invoke(*words)
+    assert (ended.exit_code, ended.stderr) == (2, message)
+
+
+def test_a_long_value_with_spaces_leaves_the_choices_in_the_message():
+    ended = invoke("reference", "ab " * 2000)
+    assert ended.exit_code == 2
+    assert "expected one of config" in ended.stderr
+    assert len(ended.stderr) < 300
+    found = str(DataError(f"the robot's 'a' and {'b ' * 100}, 'c' and {'d ' * 160}"))
+    assert "'a' and b b" in found
 
 
 def test_the_page_is_named_first_and_the_others_below(capsys):
