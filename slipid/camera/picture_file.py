@@ -13,6 +13,8 @@ from slipid.support.files import read_bytes
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """File suffixes by which images are recognised in folders and next to videos; an image file that a
 user gives directly for camera calibration may have any suffix."""
+STORED_BITS = 12
+"""Bits of cameras that are often stored in images of 16 bits without being scaled."""
 ORIENTATION_TAG = 0x0112
 _HEADER = re.compile(rb"(?:\A|Exif\0\0|eXIf|EXIF.{4}(?:Exif\0\0)?)(II\*\0|MM\0\*)", re.DOTALL)
 """Beginning of a TIFF file, or of the EXIF data in a JPEG, PNG or WebP file."""
@@ -39,11 +41,14 @@ def read_picture(path: Path, notes: list[str] | None = None) -> np.ndarray:
             list already has sentences.
 
     Raises:
-        DataError: the file is absent, empty, damaged or not an image, or has too many pixels.
+        DataError: the file is absent, empty, damaged or not an image, or has too many pixels; it is
+            animated, or uses the lowest 12 bits of 16 alone.
     """
     data = read_bytes(path, "an image")
     if not data:
         raise DataError(f"{path}: the file is empty; expected an image (PNG, JPEG, ...)")
+    if _is_animated(data):
+        raise DataError(f"{path}: an animated image; expected an image of one frame, or a video")
     orientation, data = _without_orientation(data)
     try:
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -57,12 +62,27 @@ def read_picture(path: Path, notes: list[str] | None = None) -> np.ndarray:
         )
     if picture.shape[0] * picture.shape[1] > MOST_PIXELS:
         raise _too_large(path)
+    if picture.max() < 1 << (STORED_BITS - 8):
+        stored = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH)
+        if stored is not None and stored.dtype == np.uint16 and stored.any():
+            raise DataError(
+                f"{path}: an image of 16 bits whose largest value is {stored.max()}, as of a "
+                f"camera with {STORED_BITS} bits or fewer, would be read as black; expected values "
+                "up to 65535: multiply them, or save the image with 8 bits"
+            )
     if orientation != 1 and notes == []:
         notes.append(
             f"{path}: its orientation flag (EXIF {orientation}) is not applied: the pixels are "
             "used as stored"
         )
     return np.asarray(picture)
+
+
+def _is_animated(data: bytes) -> bool:
+    """Return True for the data of a PNG or WebP file with several frames."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return b"acTL" in data[: max(data.find(b"IDAT"), 0)]
+    return data[8:16] == b"WEBPVP8X" and data[20:21] != b"" and bool(data[20] & 2)
 
 
 def _too_large(path: Path) -> DataError:

@@ -117,3 +117,29 @@ def test_pictures_above_the_limit_or_damaged_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(picture_file, "MOST_PIXELS", 23)
     with pytest.raises(DataError, match="too large an image"):
         read_picture(path)
+
+
+def test_animated_pictures_are_refused(tmp_path):
+    from PIL import Image
+
+    frames = [Image.fromarray(STORED + k) for k in range(2)]
+    for name in ("a.png", "a.webp"):
+        frames[0].save(tmp_path / name, save_all=True, append_images=frames[1:])
+        with pytest.raises(DataError, match=f"{name}: an animated image; expected"):
+            read_picture(tmp_path / name)
+        frames[0].save(tmp_path / name)
+        assert read_picture(tmp_path / name).shape == STORED.shape
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".pgm"])
+def test_values_of_12_bits_in_16_are_refused_and_16_bits_and_black_are_read(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    grey = np.arange(24, dtype=np.uint16).reshape(4, 6)
+    cv2.imwrite(str(path), grey * 178)
+    with pytest.raises(DataError, match="16 bits whose largest value is 4094, as of a camera"):
+        read_picture(path)
+    cv2.imwrite(str(path), grey * 2849)
+    assert 250 <= read_picture(path).max() <= 255
+    for black in (np.zeros((4, 6), np.uint16), np.full((4, 6), 9, np.uint8)):
+        cv2.imwrite(str(path), black)
+        assert read_picture(path).max() == black[0, 0]
