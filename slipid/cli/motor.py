@@ -86,8 +86,13 @@ def motor(
     from slipid.app.bench import bench_content, read_motor_log
     from slipid.data.reading.motor_layout import MotorOptions, given_columns
     from slipid.report.estimates import show_bench
+    from slipid.support.errors import DataError, shown
     from slipid.support.files import write_json
 
+    if delimiter is not None and len(delimiter) != 1:
+        raise DataError(
+            f"--delimiter {shown(delimiter)}: {len(delimiter)} characters; expected one, such as ;"
+        )
     columns = {
         "time": time,
         "voltage": voltage,

@@ -122,7 +122,7 @@ def test_pictures_above_the_limit_or_damaged_are_refused(tmp_path, monkeypatch):
 def test_animated_pictures_are_refused(tmp_path):
     from PIL import Image
 
-    frames = [Image.fromarray(STORED + k) for k in range(2)]
+    frames = [Image.fromarray(picture) for picture in (STORED, 255 - STORED)]
     for name in ("a.png", "a.webp"):
         frames[0].save(tmp_path / name, save_all=True, append_images=frames[1:])
         with pytest.raises(DataError, match=f"{name}: an animated image; expected"):

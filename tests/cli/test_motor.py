@@ -319,6 +319,8 @@ def test_speeds_in_turns_are_known_by_the_names_of_sysid(tmp_path):
     [
         (("--gear", "0"), "'--gear'"),
         (("--ignore", "J", "--ignore", "w"), "no column 'J' to ignore"),
+        (("--delimiter", "ab"), "--delimiter 'ab': 2 characters; expected one, such as ;"),
+        (("--current", "I:foo"), "column 'I': no unit 'foo' of a channel in A; expected one of"),
         (("--ignore", "I", "--ignore", "U"), "no column for the current or voltage"),
         (("--pulses", "w"), "only one of --pulses and --pulses-per-revolution"),
         (("--voltage", "none.csv::CH1:V"), "none.csv: cannot be read"),

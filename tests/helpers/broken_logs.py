@@ -220,7 +220,12 @@ CASES: tuple[Case, ...] = (
     Case(
         "wrong delimiter",
         _lines(lambda ls: [line.replace(";", ",") for line in ls]),
-        ("exp07.csv row 3", "no delimiter ';'", "','", "expected cells separated by ';'"),
+        (
+            "exp07.csv row 3",
+            "no delimiter ';'",
+            "','",
+            "expected cells separated by ';', or delimiter = ',' in",
+        ),
     ),
     Case(
         "wrong delimiter declared",

@@ -175,7 +175,7 @@ def given_channels(format: TableFormat, given: Mapping[str, GivenColumns]) -> di
     """Return the channels whose columns the user named; a name may lack the unit in its brackets.
 
     Raises:
-        DataError: a column is absent.
+        DataError: a column is absent, or its unit is unknown.
     """
     names, channels = _names(format), {}
     for channel, one in given.items():
@@ -183,6 +183,11 @@ def given_channels(format: TableFormat, given: Mapping[str, GivenColumns]) -> di
         for name in one.columns:
             near = [n for n in names if without_unit(n)[0] == name]
             if name not in names and len(near) != 1:
+                bare, _, unit = name.rpartition(":")
+                if bare in {*names, *(without_unit(n)[0] for n in names)}:
+                    found = f"no unit '{unit}' of a channel in {CHANNELS.get(channel, 's')}"
+                    expected = "one of `slipid reference units`, or none"
+                    raise bad_data(format.path, found, expected, column=bare)
                 found = f"no column '{name}'{did_you_mean(name, names)}"
                 raise bad_data(format.path, found, f"one of {', '.join(names)}")
             columns.append(name if name in names else near[0])

@@ -304,8 +304,12 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
     cells = cells_of(line, layout.delimiter)
     others = {line.count(d): d for d in (";", ",", "\t", "|") if d != layout.delimiter}
     if len(cells) == 1 and max(others):
-        found = f"no delimiter {layout.delimiter!r}, but {max(others)} of {others[max(others)]!r}"
-        raise bad_data(path, found, f"cells separated by {layout.delimiter!r}", row=row)
+        other = others[max(others)]
+        found = f"no delimiter {layout.delimiter!r}, but {max(others)} of {other!r}"
+        expected = (
+            f"cells separated by {layout.delimiter!r}, or delimiter = {other!r} in the layout"
+        )
+        raise bad_data(path, found, f"{expected}, and decimal points", row=row)
     if not layout.names_row:
         return [str(position) for position in range(len(cells))]
     if all(number_in(cell) is not None for cell in cells if cell):
