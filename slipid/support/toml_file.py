@@ -96,6 +96,8 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
         ]
         alike = did_you_mean(steps[-1], known)
         return f"{where}: no such key{alike}; expected one of {', '.join(known)}"
+    if kind == "missing" and isinstance(error["loc"][-1], int) and isinstance(given, list | tuple):
+        return f"{where}: {shown(list(given))}; expected more values than {len(given)}"
     if kind in ("missing", "missing_argument"):
         return f"{where}: missing; expected a value for it"
     if kind == "union_tag_not_found":

@@ -116,6 +116,11 @@ def test_other_drives(tmp_path, section, wheels, grips):
             ["robot.drive: missing", "omni, mecanum, skid, differential, steered, general"],
         ),
         (
+            "[[logs]]",
+            "[camera]\nimage_centre_m = [0.5]\n[[logs]]",
+            ["camera.image_centre_m: [0.5]; expected more values than 1"],
+        ),
+        (
             "gear_ratio = 16",
             "gear_ratio = -16",
             ["robot.gear_ratio: -16", "a number from 0.001 to 100000"],

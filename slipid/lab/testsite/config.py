@@ -106,6 +106,11 @@ def plan(path: Path, text: str) -> SimulationPlan:
         DataError: the text or a map that it names has mistakes; the message lists them by line.
     """
     mapping = mapping_of(path, text)
+    if "logs" in mapping and "runs" not in mapping:
+        raise DataError(
+            f"{path}: the config of a robot and its logs; expected that of a test site, such as "
+            "configs/testsite.toml, with the runs to simulate in tables [[runs]]"
+        )
     surfaces = mapping.get("surfaces", {})
     # a built-in surface that the config changes keeps its built-in values for omitted keys
     if isinstance(surfaces, dict):

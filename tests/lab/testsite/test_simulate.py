@@ -38,6 +38,7 @@ from tests.conftest import ROOT
 from tests.helpers.floors import surface_at
 from tests.helpers.nonsense import refuse_nonsense
 from tests.helpers.one_log import read_log
+from tests.helpers.shared import invoke
 
 SMALL = """
 seed = 3
@@ -536,3 +537,10 @@ def test_a_video_has_all_its_frames(studio, tmp_path):
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == len(frames)
     assert video.read()[1].shape == (540, 960, 3)
     assert [p.name for p in tmp_path.iterdir()] == ["run.avi"]
+
+
+def test_the_config_of_a_robot_is_named_in_a_sentence(tmp_path):
+    ended = invoke("simulate", ROOT / "configs" / "robotino2022.toml", "--out", tmp_path / "out")
+    assert ended.exit_code == 2
+    assert "the config of a robot and its logs; expected that of a test site" in ended.stderr
+    assert len(ended.stderr) < 500
