@@ -26,6 +26,7 @@ from slipid.app.problem import (
     with_mixed,
 )
 from slipid.data.check.columns import refuse_misordered
+from slipid.data.check.findings import by_reason
 from slipid.data.runs import Runs
 from slipid.data.windows import steady_duration
 from slipid.fitting.calibration.estimate import calibrate
@@ -336,6 +337,6 @@ def _judged(out: Path, data: Path, report: Reporter, glob: str | None) -> tuple[
     report.stage("reading logs")
     dataset, skipped = read_dataset(config, sections, data, report, glob)
     refuse_misordered(dataset.logs)
-    for sentence in skipped:
+    for sentence in by_reason(skipped):
         report.line(sentence)
     return config, dataset

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.app.config import LogsSection
 from slipid.app.logs import config_of_fit, read_dataset
+from slipid.data.check.findings import by_reason
 from slipid.data.log import Log
 from slipid.data.reading.reader import find_logs
 from slipid.deploy.floors import FloorLookup
@@ -80,7 +81,7 @@ def floors_under(
         )
     report.stage("reading logs")
     runs, skipped = read_dataset(config, sections, data, report)
-    for sentence in skipped:
+    for sentence in by_reason(skipped):
         report.line(sentence)
     report.stage("looking up floors")
     sessions = zip(runs.logs, runs.session, strict=True)

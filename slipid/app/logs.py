@@ -9,6 +9,7 @@ from zipfile import ZipFile
 import numpy as np
 
 from slipid.app.config import BenchMotors, Config, LogsSection, parsed, shape_of
+from slipid.data.check.findings import by_reason
 from slipid.data.gyro_heading import with_gyro_heading
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
@@ -126,7 +127,7 @@ def read_dataset(
         skipped.append(f"skipped: {short} runs with fewer rows than the min_rows of their section")
     if not logs:
         nothing = f"{root}: no run in any file of {config.path}; expected logs with a moving robot"
-        raise DataError(*([*aside, *skipped] or [nothing]))
+        raise DataError(*(by_reason([*aside, *skipped]) or [nothing]))
     return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
 
 

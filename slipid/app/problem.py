@@ -30,6 +30,7 @@ from slipid.app.floor_maps import map_path
 from slipid.app.logs import files_of, read_dataset
 from slipid.data.align.lag import pose_lag
 from slipid.data.check.columns import refuse_misordered
+from slipid.data.check.findings import by_reason
 from slipid.data.check.own_settings import own_settings
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
@@ -409,7 +410,7 @@ def fit_task(
             "camera scale"
         )
     skipped = (*skipped, *left_out)
-    for sentence in skipped:
+    for sentence in by_reason(skipped):
         report.line(sentence)
     settings = config.content.fit
     return ConfigFitTask(

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from rich.text import Text
 
+from slipid.data.check.findings import by_reason
 from slipid.fitting.calibration.result import Calibration
 from slipid.report.calibration import show_calibration
 from slipid.report.page import Groups, Page, grouped, percent, table, verdict
@@ -42,7 +43,8 @@ def show_check(page: Page, found: Content) -> None:
     if found["parameters"]:
         _show_expected(page, found["parameters"] | found["derived"])
     page.notes(found["messages"])
-    page.notes((*found.get("skipped", ()), *found.get("suspects", ())), first=True)
+    skipped = by_reason(found.get("skipped", ()))
+    page.notes((*skipped, *found.get("suspects", ())), first=True)
     page.notes(f"repaired in {count} runs: {note}" for note, count in found["notes"].items())
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from slipid.app.config import read_config
 from slipid.app.problem import read_fit_task
+from slipid.data.check.findings import by_reason
 from slipid.fitting.calibration.estimate import calibrate
 from slipid.search_space import Space
 from slipid.support.errors import DataError
@@ -113,6 +114,16 @@ def test_runs_that_are_not_in_the_table_are_set_aside(squares):
     task = task_of(folder, lines[1:])
     assert len(task.dataset) == len(lines) - 1
     assert "set aside: floor/00.csv: no row in floor/ends.csv" in task.skipped
+
+
+def test_runs_that_are_set_aside_for_one_reason_are_one_line():
+    lines = [f"set aside: {k:02}.csv: no row in ends.csv; expected one" for k in range(20)]
+    few = "00.csv, 01.csv, 02.csv, 03.csv and 16 more"
+    assert by_reason(["skipped: a: b", *lines, "set aside: x.csv: a jump", "skipped: a: b"]) == [
+        f"set aside: 20 runs ({few}): no row in ends.csv; expected one",
+        "set aside: x.csv: a jump",
+        *["skipped: a: b"] * 2,
+    ]
 
 
 def test_a_radius_that_is_given_makes_the_track_of_squares_sharp(squares):

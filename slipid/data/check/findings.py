@@ -3,6 +3,7 @@
 A finding describes what is wrong or could not be checked, and which key of the config to change.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import isclose, pi
@@ -64,6 +65,22 @@ def listed(names: Sequence[str]) -> str:
     """Return a string with the first `MOST_NAMED_RUNS` names and the number of further names."""
     more = len(names) - MOST_NAMED_RUNS
     return ", ".join(names[:MOST_NAMED_RUNS]) + (f" and {more} more" if more > 0 else "")
+
+
+def by_reason(lines: Iterable[str]) -> list[str]:
+    """Return lines, in which those of the form `set aside: RUN: REASON` come first, one a reason.
+
+    The first runs with the reason are named, and the others are counted.
+    """
+    runs: dict[str, list[str]] = {}
+    others = []
+    for line in lines:
+        if aside := re.fullmatch("set aside: (.+?): (.+)", line):
+            runs.setdefault(aside[2], []).append(aside[1])
+        else:
+            others.append(line)
+    counts = {r: f"{len(n)} runs ({listed(n)})" if len(n) > 1 else n[0] for r, n in runs.items()}
+    return [*(f"set aside: {names}: {reason}" for reason, names in counts.items()), *others]
 
 
 def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:

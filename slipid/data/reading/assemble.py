@@ -283,7 +283,7 @@ def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]
     if clock is None:
         raise UnusablePose(
             f"{next(iter(poses.values())).source.path}: the motion does not determine the offset "
-            f"of its clock from that of {log.name}; expected poses of the same run, with starts, "
+            f"of its clock from that of the run; expected poses of the same run, with starts, "
             "stops and turns in both, and the correct frame rate of the video"
         )
     # The offset refers to the times of the log, which start at 0 if the robot's clock counts from
