@@ -17,6 +17,7 @@ from slipid.data.reading.end_poses import EndPoses, read_end_poses, refuse_unuse
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import (
     AnyLayout,
+    broken_links,
     find_logs,
     matching,
     read_logs,
@@ -182,6 +183,9 @@ def files_of(
             found.append((section, _files(root, section.glob, f"{config.path}: logs.glob")))
         except DataError as error:
             skipped.append(f"skipped: {error}")
+        else:
+            if broken := broken_links(root, section.glob):
+                skipped.append(f"skipped: {broken}")
     return _of_runs(config, found, root), skipped
 
 
@@ -197,6 +201,8 @@ def matching_files(
         DataError: no file matches, or the section of a file is not clear.
     """
     rest = _files(root, glob, "--logs")
+    if broken := broken_links(root, glob):
+        raise DataError(f"--logs '{glob}': {broken}")
     out = []
     for section in sections:
         mine = set(matching(root, section.glob))

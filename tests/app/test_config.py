@@ -273,6 +273,19 @@ def test_a_set_without_files_is_skipped_with_a_line(tmp_path):
     assert "surface.blue.creep" in lines[2]
 
 
+def test_links_that_lead_nowhere_are_named(tmp_path):
+    write_good(tmp_path)
+    folder = tmp_path / "one_surface" / "gray"
+    (folder / "lost.csv").symlink_to(tmp_path / "nowhere.csv")
+    noted = KeptMessages()
+    assert len(job_of(tmp_path, GOOD, noted).dataset) == 1
+    assert noted.lines[0].startswith("skipped: 1 link leads nowhere (")
+    assert "lost.csv); expected files" in noted.lines[0]
+    (folder / "exp07.csv").unlink()
+    with pytest.raises(DataError, match=r"1 link leads nowhere \(.*lost.csv\); expected files"):
+        job_of(tmp_path, GOOD)
+
+
 def test_no_log_at_all_names_what_is_there(tmp_path):
     write_good(tmp_path)
     with pytest.raises(DataError, match=r"no file matches 'runs/\*'.*generic/, my.toml, one_sur"):

@@ -242,6 +242,8 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
     found = sorted(p for p in matching(root, pattern) if p.is_file() or _is_bag(p))
     if found:
         return found
+    if broken := broken_links(root, pattern):
+        raise DataError(f"{root}: {broken}")
     nearest = root
     for part in Path(pattern).parts[:-1]:
         if not (nearest / part).is_dir():
@@ -252,6 +254,13 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
         f"{root}: no file matches '{pattern}'; expected at least one "
         f"({nearest} has {first_names(inside, 'nothing in it')})"
     )
+
+
+def broken_links(root: Path, pattern: str) -> str:
+    """Return a message about links that match a glob and lead nowhere, empty if there are none."""
+    links = sorted(str(p) for p in matching(root, pattern) if p.is_symlink() and not p.exists())
+    count = "1 link leads" if len(links) == 1 else f"{len(links)} links lead"
+    return f"{count} nowhere ({first_names(links)}); expected files" if links else ""
 
 
 def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
