@@ -76,8 +76,11 @@ def design(scope: Scope) -> Design:
         DataError: the fit lacks a requested parameter, floor, load or prediction.
     """
     fit = scope.fit
-    planner = Planner.of(fit)
     candidates = scope.candidates()
+    _paths(fit, scope.parameters)  # goals are computed after the simulation, and checked before it
+    for text in scope.predictions:
+        scope.predicted(text)
+    planner = Planner.of(fit)
     rows, now = planner.rows(candidates), planner.after(fit)
     last = now.plus(rows, info.UNLIMITED_REPEATS)
     weights = _goals(scope, planner)

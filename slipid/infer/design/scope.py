@@ -13,6 +13,9 @@ from slipid.support.errors import DataError
 MOST_SPEEDS = 4
 """Largest number of candidate speeds of a floor."""
 
+MOST_S = 3600.0
+"""Longest duration of a candidate run whose distance or speed is given by an option [s]."""
+
 
 def _numbers(name: str, text: str | None, least: float = -3600.0) -> tuple[float, ...] | None:
     if text is None:
@@ -124,6 +127,12 @@ class Scope:
             _numbers("headings", self.headings) or HEADINGS,
             np.radians(turns).tolist() if turns else None,
         )
+        given = {self.length, self.speeds, self.turns} != {None}
+        if found and given and (longest := max(d.seconds(self.base) for d in found)) > MOST_S:
+            raise DataError(
+                f"--distance, --speeds and --turns: a candidate run of {longest:.3g} s; expected a "
+                f"shorter distance, or higher speeds, for runs of at most {MOST_S:g} s"
+            )
         return self._drivable(
             found,
             "no candidate run remains; expected at least one heading and speed, or turning rate, "

@@ -147,9 +147,12 @@ def test_an_unreachable_goal_exits_with_1_and_names_the_channel(folder):
         (("--headings", "north"), "expected 1 to 100 numbers from -3600 to 3600 sep"),
         (("--distance", "0"), "'--distance': "),
         (("--speeds", "0", "--turns", "0"), "no candidate run remains"),
+        (("--speeds", "0.1,0.0001", "--distance", "10000"), "a candidate run of 1e+08 s; expected"),
     ],
 )
-def test_bad_options_exit_with_2_and_list_the_choices(folder, words, message):
+def test_bad_options_exit_with_2_and_list_the_choices(folder, words, message, monkeypatch):
+    """Before anything is simulated."""
+    monkeypatch.setattr(Planner, "rows", lambda *_: pytest.fail("simulated"))
     done = design(folder, *words)
     assert done.exit_code == 2
     assert message in done.stderr
