@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from slipid.infer.bench.rows import Between
 from slipid.model import geometry as g
 from slipid.model.geometry import Geometry
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, shown
 from slipid.support.quantities import (
     Bounds,
     Coordinate,
@@ -554,6 +554,11 @@ def geometry(robot: Wheels) -> Geometry:
     radius, gear = robot.wheel_radius_m, robot.gear_ratio
     if isinstance(robot, OmniDrive):
         azimuths, base = robot.wheel_azimuths_deg, robot.base_radius_m
+        if len({round(azimuth % 360, 3) % 360 for azimuth in azimuths}) < 3:
+            raise ValueError(
+                f"wheel azimuths {shown(azimuths)} deg, with which the wheels do not drive in all "
+                "directions; expected at least three different ones"
+            )
         shared = robot.drive_of(len(azimuths))
         return g.omni(azimuths, base, radius, gear, robot.roller_angle_deg, shared)
     if isinstance(robot, FourWheelDrive):

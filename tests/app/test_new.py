@@ -179,6 +179,7 @@ def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
             "--azimuths-deg: not an option for drive skid",
         ),
         ({"wheels": "4", "azimuths_deg": "1,2,3"}, "3 angles; expected 4, one per wheel"),
+        ({"azimuths_deg": "60,60,420"}, "expected at least three different ones"),
         ({"drive": "skid", "shared": "perhaps"}, "--shared 'perhaps': expected yes or no"),
         ({"drive": "general", "places_m": "1, 2"}, "--places-m '1, 2': expected x, y of each"),
         ({"drive": "general", **FOUR, "rollers_deg": "0, 1, 2"}, "run freely along it"),

@@ -103,6 +103,8 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
         raise bad_data(path, "no rows of numbers", "a log: a row of numbers for every time")
     names_row, units_row = _header_rows(rows[:first], len(rows[first]))
     top = rows[names_row - 1] if names_row else []
+    if not top and first:
+        _refuse_short_names(path, rows[first - 1], len(rows[first]), first)
     if not top and any(number_in(c) is None and c.lower() not in MISSING for c in rows[first]):
         expected = "a log with a row of column names, or with numbers only"
         raise bad_data(path, "text among the numbers, and no names", expected, row=first + 1)
@@ -200,6 +202,22 @@ def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
     cells = [cell for cell in rows[units - 1] if cell]
     words = any(len(cell) > 4 and cell.isalpha() for cell in cells)
     return (units, 0) if words and len(set(cells)) == len(cells) else (0, 0)
+
+
+def _refuse_short_names(path: Path, above: list[str], width: int, row: int) -> None:
+    """Raise `DataError` if rows have more cells than names, but at most two for each name.
+
+    Args:
+        path: the file.
+        above: cells of the line above the rows of numbers.
+        width: number of cells in a row of numbers.
+        row: number of that line, counted from 1.
+    """
+    texts = [cell for cell in above if cell and number_in(cell) is None]
+    if len(texts) == len(above) > 1 and len(above) < width <= 2 * len(above):
+        found = f"{len(above)} names, but {width} cells in the rows below"
+        expected = "as many (decimal commas, with a comma between cells as well?)"
+        raise bad_data(path, found, expected, row=row)
 
 
 def _refuse_commas(path: Path, body: list[list[str]], delimiter: str, first: int) -> None:

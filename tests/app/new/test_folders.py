@@ -149,6 +149,10 @@ def test_what_is_no_log_is_one_clear_error(tmp_path):
     (tmp_path / "sub" / "comma.csv").write_text(f"t;x\n{rows}\n")
     with pytest.raises(DataError, match="decimal points, not commas"):
         propose(tmp_path / "sub" / "comma.csv", {})
+    rows = "\n".join(f"{k},5,0,1" for k in range(30))
+    (tmp_path / "sub" / "comma.csv").write_text(f"t,x\n{rows}\n")
+    with pytest.raises(DataError, match="row 1: 2 names, but 4 cells in the rows below; expected"):
+        propose(tmp_path / "sub" / "comma.csv", {})
 
 
 def test_a_file_of_which_no_column_is_known_is_a_question_and_still_a_config(tmp_path):
