@@ -1,5 +1,6 @@
 """Frames from the file, folder or device that a user gives."""
 
+import stat
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -14,6 +15,7 @@ from slipid.camera.opencv import cv2, size_of
 from slipid.camera.picture_file import is_picture, pictures_in, read_picture
 from slipid.camera.video import Video
 from slipid.support.errors import DataError, shown
+from slipid.support.files import PIPE
 
 LONGEST_NUMBER = 4
 """Largest number of digits in the number of a camera device."""
@@ -176,14 +178,16 @@ def open_source(
             "omit --seconds"
         )
     try:
-        size = path.stat().st_size
+        kept = path.stat()
     except (OSError, ValueError):
         expected = "a video or a folder of images"
         raise DataError(f"{path}: no such file or folder; expected {expected}") from None
     given = None if times is None else read_times(times)
     if path.is_dir():
         return PictureFolder.at(path, fps, given)
-    if not size:
+    if not stat.S_ISREG(kept.st_mode):
+        raise DataError(f"{path}: {PIPE}; expected a video or a folder of images")
+    if not kept.st_size:
         raise DataError(f"{path}: the file is empty; expected a video")
     if is_picture(path):
         given = even_times(1, fps or 1.0) if given is None else given

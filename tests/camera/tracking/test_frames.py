@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from unittest.mock import Mock
@@ -177,6 +178,12 @@ def test_places_without_anything(tmp_path):
         open_source(str(tmp_path / "absent.mp4"))
     with pytest.raises(DataError, match="no such file or folder"):
         open_source("a" * 5000)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other devices")
+def test_a_device_that_is_no_camera_is_named_as_a_device():
+    with pytest.raises(DataError, match="/dev/zero: a pipe or a device; save it to a file first"):
+        open_source("/dev/zero")
 
 
 def test_identity_changes_with_the_file_and_its_times(tmp_path):
