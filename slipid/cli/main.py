@@ -4,6 +4,9 @@ Commands import their libraries when they run, so that `slipid --help` does not 
 """
 
 import _thread
+import errno
+import logging
+import os
 import re
 import sys
 import threading
@@ -273,9 +276,38 @@ AGAIN_S = 0.05
 
 
 def main() -> None:
-    """Run the `slipid` command."""
+    """Run the `slipid` command; exit with code 2 if standard output cannot be written."""
     sys.unraisablehook = _interrupt_again
-    app()
+    # where its folders cannot be written, matplotlib works all the same
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    try:
+        app()
+    except (OSError, SystemExit) as end:
+        lost = _lost_output(probe=isinstance(end, OSError))
+        if lost is None:
+            raise
+        if lost.errno == errno.EPIPE:  # a reader such as `head` has enough
+            sys.exit(1)
+        typer.echo(f"standard output cannot be written ({lost.strerror})", err=True)
+        sys.exit(2)
+
+
+def _lost_output(probe: bool) -> OSError | None:
+    """Return the error with which standard output cannot be written, None if it can be.
+
+    After an error, nothing more is written to it, since Python would repeat the error at its end.
+    With `probe`, a line end is written, as an output without a buffer has nothing left to write.
+    """
+    if sys.stdout is None:
+        return None
+    try:
+        sys.stdout.flush()
+        if probe:
+            os.write(sys.stdout.fileno(), b"\n")
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return error
+    return None
 
 
 def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:

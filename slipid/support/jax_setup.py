@@ -2,6 +2,7 @@
 
 import os
 import sys
+import warnings
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -75,6 +76,7 @@ def setup_jax(quiet: bool = False) -> None:
 
     one_blas_thread()
 
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     jax.config.update("jax_enable_x64", True)
     # processes of jobs inherit this, or the arrays of their first job would be rounded to float32
     os.environ["JAX_ENABLE_X64"] = "1"

@@ -73,6 +73,23 @@ def test_wrong_usage_is_2(words):
     assert invoke(*words).exit_code == 2
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
+@pytest.mark.parametrize("buffer", ["", "1"])
+@pytest.mark.parametrize("words", [("--help",), ("reference", "units"), ("robots", "--json", "-")])
+def test_a_full_disk_for_standard_output_is_2_and_a_sentence(words, buffer):
+    kept = {**os.environ, "PYTHONUNBUFFERED": buffer}
+    command = [sys.executable, "-m", "slipid", *words]
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run(command, env=kept, stdout=full, stderr=subprocess.PIPE, text=True)
+    found = (ended.returncode, ended.stderr)
+    assert found == (2, "standard output cannot be written (No space left on device)\n")
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = subprocess.run(command, env=kept, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (1, "")
+
+
 @pytest.mark.parametrize("command", ["identify", "check"])
 def test_a_bad_config_is_2_and_a_message(tmp_path, command):
     bad = tmp_path / "bad.toml"

@@ -125,19 +125,23 @@ def test_names_that_no_json_can_have_are_refused_before_the_work(name, tmp_path,
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_a_home_and_its_cache_commands_compute_and_draw(tmp_path):
+def test_without_a_home_and_its_cache_commands_compute_and_draw_in_silence(tmp_path):
     code = (
         "import sys; from pathlib import Path\n"
         "from slipid.support.jax_setup import setup_jax; setup_jax(quiet=True)\n"
         "import jax; assert float(jax.jit(lambda x: x + 1)(1.0)) == 2.0\n"
-        "from slipid.plots import drawing\n"
-        "drawing.save(drawing.figure(2.0, 2.0, 'empty'), Path(sys.argv[1]))\n"
+        "def draw():\n"
+        "    from slipid.plots import drawing\n"
+        "    drawing.save(drawing.figure(2.0, 2.0, 'empty'), Path(sys.argv[1]))\n"
+        "from slipid.cli import main; main.app = draw; main.main()\n"
     )
     gone = ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "JAX_COMPILATION_CACHE_DIR", "SLIPID_CACHE")
     kept = {k: v for k, v in os.environ.items() if k not in (*gone, "MPLCONFIGDIR")}
     nowhere = dict.fromkeys(("HOME", "TMPDIR"), "/dev/null/nowhere")
     words = [sys.executable, "-c", code, tmp_path / "empty.png"]
-    subprocess.run(words, env=kept | nowhere, check=True)
+    for cache in ({}, {"JAX_COMPILATION_CACHE_DIR": "/dev/null/nowhere"}):
+        done = subprocess.run(words, env=kept | nowhere | cache, check=True, capture_output=True)
+        assert done.stderr == b""
     assert [p.name for p in tmp_path.iterdir()] == ["empty.png"]
 
 
