@@ -10,7 +10,8 @@ import os
 import re
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from inspect import cleandoc
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -39,10 +40,14 @@ from slipid.cli.simulate import simulate
 from slipid.cli.track import track
 from slipid.cli.trial import trial
 from slipid.cli.validate import compare, validate
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, with_short_words
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
+
+
+UsageError: Any = typer.BadParameter.__base__
+"""Typer's error for wrong usage, which it does not export."""
 
 
 class Command(NamedTuple):
@@ -167,6 +172,16 @@ PANELS: dict[str, tuple[Command, ...]] = {
 """Commands in the panels of the help."""
 
 
+@contextmanager
+def _short_message() -> Iterator[None]:
+    """Return a context in which Typer's messages about wrong usage have no long words."""
+    try:
+        yield
+    except UsageError as error:
+        error.message = with_short_words(error.message)
+        raise
+
+
 class CommandHelp(TyperCommand):
     """A command whose help lists its options in panels, as text that is not boxed.
 
@@ -174,15 +189,16 @@ class CommandHelp(TyperCommand):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        given, *_ = self.make_parser(ctx).parse_args(args=list(args))
-        try:
-            if self.callback is not None and not ctx.resilient_parsing:
-                refuse_odd(self.callback, self.get_params(ctx), given)
-        except DataError as error:
-            typer.echo(str(error), err=True)
-            raise typer.Exit(2) from None
-        parsed: list[str] = super().parse_args(ctx, args)
-        return parsed
+        with _short_message():
+            given, *_ = self.make_parser(ctx).parse_args(args=list(args))
+            try:
+                if self.callback is not None and not ctx.resilient_parsing:
+                    refuse_odd(self.callback, self.get_params(ctx), given)
+            except DataError as error:
+                typer.echo(str(error), err=True)
+                raise typer.Exit(2) from None
+            parsed: list[str] = super().parse_args(ctx, args)
+            return parsed
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         panels: dict[str, list[tuple[str, str]]] = {}
@@ -200,6 +216,15 @@ class CommandHelp(TyperCommand):
 
 class CommandList(TyperGroup):
     """The group of all commands, whose help lists them in panels, a line each."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        with _short_message():
+            parsed: list[str] = super().parse_args(ctx, args)
+            return parsed
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        with _short_message():
+            return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         width = max(len(_name(one)) for commands in PANELS.values() for one in commands)

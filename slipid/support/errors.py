@@ -41,8 +41,7 @@ def _bounded(message: str) -> str:
     message = "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in message)
     if len(message) <= LONGEST:
         return message
-    message = _QUOTED.sub(_shortened, message)
-    message = _LONG_WORD.sub(_shortened, message)
+    message = with_short_words(_QUOTED.sub(_shortened, message))
     lines = message.split("\n")
     for count in range(len(lines), 0, -1):
         more = f"\n... ({len(lines) - count} more)" if count < len(lines) else ""
@@ -50,6 +49,11 @@ def _bounded(message: str) -> str:
         if len(kept) <= LONGEST:
             return kept
     return f"{message[: LONGEST - 3]}..."
+
+
+def with_short_words(message: str) -> str:
+    """Return a message without the middles of its words of over 80 characters."""
+    return _LONG_WORD.sub(_shortened, message)
 
 
 def _shortened(found: re.Match[str]) -> str:

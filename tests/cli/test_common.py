@@ -74,6 +74,16 @@ def test_odd_values_are_refused_in_a_sentence(words, message):
     assert (ended.exit_code, ended.stderr) == (2, message)
 
 
+@pytest.mark.parametrize(
+    "words", [("x" * 5000,), ("check", f"--{'x' * 5000}"), ("--" + "x" * 999,)]
+)
+def test_wrong_usage_is_short(words):
+    ended = invoke(*words)
+    assert ended.exit_code == 2
+    assert "x...x" in ended.stderr
+    assert len(ended.stderr) < 600
+
+
 def test_a_long_value_with_spaces_leaves_the_choices_in_the_message():
     ended = invoke("reference", "ab " * 2000)
     assert ended.exit_code == 2
