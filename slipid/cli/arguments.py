@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from slipid.support.errors import DataError, shown
@@ -16,7 +17,8 @@ def refuse_odd(
     """Raise `DataError` for a value that is empty, has control characters, or is no number.
 
     Converted values no longer show it: an empty path is that of the working folder, and Typer calls
-    NaN too large. A single control character is accepted, as a tab separates cells.
+    NaN too large. A single control character is accepted, as a tab separates cells; paths are
+    checked where they are used.
 
     Args:
         command: function of the command.
@@ -31,9 +33,10 @@ def refuse_odd(
         for text in _texts(given.get(param.name)):
             if not text.strip(" "):
                 raise DataError(f"{name} is empty; expected {expected}")
-            if len(text) > 1 and any(ord(c) < 32 or 127 <= ord(c) < 160 for c in text):
+            odd = len(text) > 1 and any(ord(c) < 32 or 127 <= ord(c) < 160 for c in text)
+            if odd and not _has_kind(command, param.name, Path):
                 raise DataError(f"{name} {shown(text)}; expected a value without line breaks")
-            if text.lower().lstrip("+-") == "nan" and _is_number(command, param.name):
+            if text.lower().lstrip("+-") == "nan" and _has_kind(command, param.name, float, int):
                 raise DataError(f"{name}: nan; expected a number")
 
 
@@ -46,7 +49,7 @@ def _texts(given: object) -> Iterator[str]:
             yield from _texts(one)
 
 
-def _is_number(command: Callable[..., object], name: str) -> bool:
-    """Return True if a parameter of a command's function is a number."""
+def _has_kind(command: Callable[..., object], name: str, *kinds: type) -> bool:
+    """Return True if a parameter of a command's function is, if given, of one of these types."""
     hint = get_type_hints(inspect.unwrap(command)).get(name)
-    return bool({float, int} & {hint, *get_args(hint)})
+    return not {*kinds}.isdisjoint({hint, *get_args(hint)})
