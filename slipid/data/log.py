@@ -17,11 +17,13 @@ class WheelReading:
         channel: channel of the layout; empty if unknown.
         gear_ratio: gear ratio of the layout.
         whole: True if an angle of the layout had whole numbers of radians only, as ticks have.
+        columns: name of each wheel's column; empty if unknown.
     """
 
     channel: str = ""
     gear_ratio: float = 1.0
     whole: bool = False
+    columns: tuple[str, ...] = ()
 
     @property
     def divided_by(self) -> float:

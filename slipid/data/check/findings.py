@@ -19,6 +19,11 @@ Severity = Literal["wrong", "suspicious", "note"]
 """Severity of a finding: `wrong` must be corrected before a fit, `suspicious` may be correct but
 should be examined, `note` reports what could not be checked."""
 SEVERITIES: tuple[Severity, ...] = ("wrong", "suspicious", "note")
+LEAST_PATH_M = 0.2
+"""A run is judged if the path length by the wheels exceeds this, since its poses must then move
+[m]."""
+ROUNDING_M = 1e-6
+"""Poses with a path shorter than this are constant, except for rounding [m]."""
 MOST_NAMED_RUNS = 4
 """Largest number of runs that a sentence names; further runs are only counted."""
 
@@ -95,7 +100,7 @@ def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 NOT_CALIBRATED = frozenset(
     (
-        *("no_motion", "wheel_sign", "wheel_order", "wheel_azimuths", "wheel_columns"),
+        *("no_motion", "wheel_constant", "position_constant", "wheel_sign", "wheel_order", "wheel_azimuths", "wheel_columns"),
         *("heading_constant", "heading_sign", "heading_unit", "heading_offset"),
         *("heading_quaternion", "pose_axis", "pose_swapped", "pose_mirrored", "pose_constant"),
         *("pose_of_another_run", "pose_unexplained", "steering_sign"),

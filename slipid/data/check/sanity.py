@@ -4,9 +4,9 @@ Encoders, commands, gyro, currents and poses must agree with each other and with
 config. Single runs are searched for constant poses and for poses of another run.
 
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_ticks`,
-`wheel_speed_unit`, `no_motion`, `heading_constant`, `heading_sign`, `heading_unit`,
+`wheel_speed_unit`, `wheel_constant`, `no_motion`, `heading_constant`, `heading_sign`, `heading_unit`,
 `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`, `pose_mirrored`, `pose_length`,
-`pose_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`, `base_radius`, `time_unit`,
+`pose_constant`, `position_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`, `base_radius`, `time_unit`,
 `current_sign`, `current_order`, `current_unit`, `current_of_supply`, `voltage_sign`,
 `voltage_order`, `voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`, `command_order`,
 `command_unit`, `command_exchanged`, `wheel_columns`, `scales`, `travel`, `steering_sign`,
@@ -28,7 +28,9 @@ from slipid.data.check.columns import (
     misordered,
 )
 from slipid.data.check.findings import (
+    LEAST_PATH_M,
     LEAST_TURN_RAD,
+    ROUNDING_M,
     ROUNDING_RAD,
     Finding,
     cause_findings,
@@ -60,6 +62,7 @@ from slipid.data.check.ratios import (
     ticks_per_radian,
     without_factor,
 )
+from slipid.data.check.stuck import stuck_channels
 from slipid.data.check.steered import steered_findings
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import MOVED_M
@@ -119,6 +122,12 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
     still = tuple(_no_motion(data, float(geometry.wheel_radius)))
     if still and not still[0].runs:
         return still
+    unmoved, useless = stuck_channels(data, geometry)
+    still += unmoved
+    if useless.all():
+        return worst_first(still)
+    if useless.any():  # these runs would spoil the comparison of the others
+        data = data.subset(np.flatnonzero(~useless))
     if geometry.driven is not None:
         return worst_first([*still, *steered_findings(data, geometry)])
     found = (*still, *_all(data, geometry, mass_kg))
@@ -323,11 +332,6 @@ def _not_checked(what: str) -> Finding:
     return Finding("not_checked", what, None, "note")
 
 
-LEAST_PATH_M = 0.2
-"""A run is judged if the path length by the wheels exceeds this, since its poses must then move
-[m]."""
-ROUNDING_M = 1e-6
-"""Poses with a path shorter than this are constant, except for rounding [m]."""
 LEAST_ROWS = 20
 """Runs with fewer rows are not judged."""
 ODD_DISAGREEMENT, ODD_RATIO, USUAL_COSINE = 0.3, 10.0, 0.9

@@ -178,7 +178,8 @@ def _reading(name: str | None, signals: Mapping[str, Signal], layout: SensorLayo
     values = signals[name].values[~np.isnan(signals[name].values)]
     whole = name.endswith("angle") and bool((values == np.round(values)).all())
     whole = whole and len(np.unique(values)) >= _FEWEST_TICKS
-    return WheelReading(name, layout.gear_ratio, whole)
+    columns = signals[name].source.columns
+    return WheelReading(name, layout.gear_ratio, whole, tuple(columns))
 
 
 def per_wheel(name: str, layout: SensorLayout) -> float:

@@ -368,7 +368,7 @@ def test_whole_angles_are_marked_as_perhaps_ticks(root):
         columns = {"wheel_ticks": False, "motor_angle": turns}
         return generic(root, columns=columns).wheel_reading
 
-    assert read("rad") == WheelReading("motor_angle", 10.0, whole=True)
+    assert read("rad") == WheelReading("motor_angle", 10.0, True, ("left", "right"))
     assert not read("deg").whole  # of one degree an encoder may be
     assert not read("rad", 0.01).whole
     assert not generic(root).wheel_reading.whole  # ticks are whole as they should be

@@ -1,0 +1,179 @@
+"""Search for encoders and positions that stay constant in whole runs although the robot moves.
+
+A wheel may rightly stand still while others turn: a robot turns about it, or an omni robot drives
+along its axle. Its encoder is stuck only if the poses move the rim r of the wheel,
+
+    r = d . (dx, dy) + c turn
+
+where d is the drive direction of the wheel. The factor c is its lever in the config, changed by up
+to `LEVER_BASES` base radii such that r is as small as possible, since neither the place of the pose
+sensor nor the effective track are known before a calibration.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from slipid.data.check.findings import LEAST_PATH_M, ROUNDING_M, ROUNDING_RAD, Finding, Severity
+from slipid.data.check.joined import (
+    PoseConvention,
+    body_motion,
+    edges,
+    increments,
+    joined,
+)
+from slipid.data.runs import Runs
+from slipid.model.geometry import Geometry
+
+STILL_SHARE = 0.01
+"""A wheel stands still in a run if the range of its angle is below this share of the largest range
+of a wheel, which allows for an encoder that flickers by a tick [1]."""
+EXPECTED_SHARE = 0.5
+"""An encoder is stuck if the poses move the rim of its wheel by more than this share of the travel
+of the wheel that turns most. The share of a wheel on whose axle an omni robot drives stays below
+0.3 with a marker that is rotated by 15 deg, and slip only shortens the poses' motion [1]."""
+LEVER_BASES = 2.0
+"""Largest change of the lever of a wheel, in base radii: one for a pose sensor at the edge of the
+robot, one for the effective track of a skid-steer robot, up to twice the track [1]."""
+TRANSLATION_SHARE = 0.5
+"""Least translation computed from the wheels over their rotation, as an arc at the base radius, for
+a judgement of constant positions; in a turn on the spot unequal wheels cause less [1]."""
+
+
+def stuck_channels(
+    runs: Runs, geometry: Geometry
+) -> tuple[tuple[Finding, ...], Bool[np.ndarray, " run"]]:
+    """Return findings about stuck encoders and positions, and the runs that these make useless."""
+    data = joined(runs)
+    at = edges(data)
+    moved = increments(data, at, 0.0)
+    rim = float(geometry.wheel_radius) * np.nan_to_num(moved.wheels)
+    body = body_motion(at, PoseConvention())
+    if moved.twist is not None:  # instead of poses that are not whole
+        body = np.where(np.isfinite(body).all(axis=1)[:, None], body, moved.twist)
+    parts = np.split(np.arange(len(rim)), np.flatnonzero(np.diff(at.run)) + 1)
+    span = np.array([np.ptp(np.cumsum(rim[part], axis=0), axis=0) for part in parts])
+    most = span.max(axis=1, initial=0.0)
+    still = (span < STILL_SHARE * most[:, None]) & (most > LEAST_PATH_M)[:, None]
+    expected = np.full(still.shape, np.nan)
+    for run in np.flatnonzero(still.any(axis=1)).tolist():
+        path = _expected(body[parts[run]], rim[parts[run]], geometry)
+        expected[run] = np.where(still[run], path, np.nan)
+    stuck = _frozen(runs, geometry, [rim[part] for part in parts])
+    found = [_positions_constant(runs, stuck)] if stuck.any() else []
+    for wheel in range(still.shape[1]):
+        which, path = still[:, wheel], expected[:, wheel]
+        every = which.any() and bool(which[most > LEAST_PATH_M].all())
+        if not (path > 0).any():
+            if every and np.isnan(path).all():
+                found.append(_never_turns(runs, wheel, float(most.max()), geometry))
+                stuck |= found[-1].severity == "wrong"
+            continue
+        which = which & (every | (path > 0))
+        found.append(_wheel_constant(runs, wheel, which, float(np.nanmax(path))))
+        stuck |= which | every
+    return tuple(found), stuck
+
+
+def _expected(
+    body: Float[np.ndarray, "step 3"], rim: Float[np.ndarray, "step wheel"], geometry: Geometry
+) -> Float[np.ndarray, " wheel"]:
+    """Return by how far the body moves the rim of each wheel in a run [m].
+
+    The path is a sum over parts in which the wheel that turns most travels `LEAST_PATH_M`, since
+    the noise of poses would add up over steps. It is 0 below `EXPECTED_SHARE` of that travel, and
+    nan if the motion of the body is not known.
+    """
+    known = np.isfinite(body).all(axis=1)
+    body, rim = body[known], rim[known]
+    travel = np.abs(rim).sum(axis=0)
+    if travel.max(initial=0.0) < LEAST_PATH_M:
+        return np.full(rim.shape[1], np.nan)
+    turned = np.cumsum(np.abs(rim[:, np.argmax(travel)]))
+    _, part = np.unique(turned // LEAST_PATH_M, return_inverse=True)
+    x, y, turn = (np.bincount(part, column) for column in body.T)
+    slack, squares = LEVER_BASES * float(geometry.base_radius), max(float(turn @ turn), 1e-300)
+    out = np.zeros(rim.shape[1])
+    for wheel, (ahead, left, lever) in enumerate(np.asarray(geometry.forward())):
+        along = ahead * x + left * y
+        least = np.clip(-(along @ turn) / squares, lever - slack, lever + slack)
+        out[wheel] = np.abs(along + least * turn).sum()
+    return np.where(out > EXPECTED_SHARE * travel.max(), out, 0.0)
+
+
+def _frozen(
+    runs: Runs, geometry: Geometry, rim: Sequence[Float[np.ndarray, "step wheel"]]
+) -> Bool[np.ndarray, " run"]:
+    """Return, for each run, whether x and y are constant although its wheels drive the robot on.
+
+    Runs with constant headings are left to the finding about whole poses that are constant.
+    """
+    to_body, base = np.asarray(geometry.pseudo_inverse()), float(geometry.base_radius)
+    out = np.zeros(len(runs), bool)
+    for run in range(len(runs)):
+        pose = runs.pose[runs.rows(run)]
+        pose = pose[np.isfinite(pose).all(axis=1)]
+        if not len(pose):
+            continue
+        x, y, heading = np.ptp(pose, axis=0)
+        dx, dy, turn = np.abs(rim[run] @ to_body.T).sum(axis=0)
+        driven = max(dx, dy) > max(LEAST_PATH_M, TRANSLATION_SHARE * base * turn)
+        out[run] = max(x, y) < ROUNDING_M and heading > ROUNDING_RAD and driven
+    return out
+
+
+def _positions_constant(runs: Runs, which: Bool[np.ndarray, " run"]) -> Finding:
+    """Return the finding about the runs whose positions are constant."""
+    return Finding(
+        "position_constant",
+        f"x and y of the poses never change in {which.sum()} of {len(which)} runs, although the "
+        "wheels drive the robot on",
+        "check the columns of pose_x and pose_y, and that the tracker did not freeze"
+        if which.all()
+        else "exclude these runs from the globs of [[logs]], since the tracker froze",
+        runs=() if which.all() else _names(runs, which),
+    )
+
+
+def _wheel_constant(
+    runs: Runs, wheel: int, which: Bool[np.ndarray, " run"], path: float
+) -> Finding:
+    """Return the finding about the runs in which an encoder is stuck.
+
+    `path` is the longest path by which the body moves the rim of its wheel in one of them [m].
+    """
+    return Finding(
+        "wheel_constant",
+        f"{_wheel(runs, wheel)} never turns in {which.sum()} of {len(which)} runs, while other "
+        f"wheels turn and the robot moves its rim by up to {path:.2g} m",
+        "check its encoder and cable, or whether the wheel was blocked"
+        + ("" if which.all() else "; exclude these runs from the globs of [[logs]]"),
+        runs=() if which.all() else _names(runs, which),
+    )
+
+
+def _never_turns(runs: Runs, wheel: int, most: float, geometry: Geometry) -> Finding:
+    """Return the finding about a wheel that turns in no run, if no run has whole poses.
+
+    An omni robot may have driven along its axle; on other robots a wheel that turns in no run is
+    not determined at all. `most` is the longest travel of a wheel in a run [m].
+    """
+    severity: Severity = "suspicious" if geometry.determines_twist else "wrong"
+    return Finding(
+        "wheel_constant",
+        f"{_wheel(runs, wheel)} turns in no run, while other wheels travel up to {most:.2g} m",
+        "check its encoder and cable"
+        + (", unless the robot drove along its axle alone" if severity == "suspicious" else ""),
+        severity,
+    )
+
+
+def _wheel(runs: Runs, wheel: int) -> str:
+    """Return the number of a wheel, from 1, and the name of its column if that is known."""
+    columns = runs.logs[0].wheel_reading.columns
+    return f"wheel {wheel + 1}" + (f" (column {columns[wheel]!r})" if wheel < len(columns) else "")
+
+
+def _names(runs: Runs, which: Bool[np.ndarray, " run"]) -> tuple[str, ...]:
+    return tuple(runs.logs[k].name for k in np.flatnonzero(which))
