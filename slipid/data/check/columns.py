@@ -24,7 +24,7 @@ from slipid.support.errors import DataError
 MADE_REDUNDANT_BY = ("wheel_sign", "wheel_order", "command_sign", "command_order")
 """Kinds of findings, found by comparison with the poses, that make a `wheel_columns` finding
 redundant."""
-CAUSED_BY_ORDER = ("wheel_scale", "wheel_speed_unit")
+CAUSED_BY_ORDER = ("wheel_scale", "wheel_speed_unit", "wheels_exchanged")
 """Kinds of findings that may only be consequences of a wrong order of columns. They are omitted if
 there is a `wheel_columns` finding; once its remedy is applied, the next check reports them if they
 are real."""

@@ -100,7 +100,16 @@ def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 NOT_CALIBRATED = frozenset(
     (
-        *("no_motion", "wheel_constant", "position_constant", "wheel_sign", "wheel_order", "wheel_azimuths", "wheel_columns"),
+        *(
+            "no_motion",
+            "wheel_constant",
+            "position_constant",
+            "wheels_exchanged",
+            "wheel_sign",
+            "wheel_order",
+            "wheel_azimuths",
+            "wheel_columns",
+        ),
         *("heading_constant", "heading_sign", "heading_unit", "heading_offset"),
         *("heading_quaternion", "pose_axis", "pose_swapped", "pose_mirrored", "pose_constant"),
         *("pose_of_another_run", "pose_unexplained", "steering_sign"),

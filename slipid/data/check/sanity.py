@@ -1,20 +1,21 @@
 """The sanity check of runs before a fit.
 
 Encoders, commands, gyro, currents and poses must agree with each other and with the geometry in the
-config. Single runs are searched for constant poses and for poses of another run.
+config. Single runs are searched for constant wheels and poses, for exchanged columns, and for poses
+of another run.
 
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_ticks`,
-`wheel_speed_unit`, `wheel_constant`, `no_motion`, `heading_constant`, `heading_sign`, `heading_unit`,
-`heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`, `pose_mirrored`, `pose_length`,
-`pose_constant`, `position_constant`, `pose_of_another_run`, `pose_unexplained`, `lag`, `base_radius`, `time_unit`,
-`current_sign`, `current_order`, `current_unit`, `current_of_supply`, `voltage_sign`,
-`voltage_order`, `voltage_unit`, `gyro_sign`, `gyro_unit`, `command_sign`, `command_order`,
-`command_unit`, `command_exchanged`, `wheel_columns`, `scales`, `travel`, `steering_sign`,
-`steering_scale`, `not_checked`.
+`wheel_speed_unit`, `wheel_constant`, `no_motion`, `heading_constant`, `heading_sign`,
+`heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
+`pose_mirrored`, `pose_length`, `pose_constant`, `position_constant`, `pose_of_another_run`,
+`pose_unexplained`, `lag`, `base_radius`, `time_unit`, `current_sign`, `current_order`,
+`current_unit`, `current_of_supply`, `voltage_sign`, `voltage_order`, `voltage_unit`, `gyro_sign`,
+`gyro_unit`, `command_sign`, `command_order`, `command_unit`, `command_exchanged`, `wheel_columns`,
+`wheels_exchanged`, `scales`, `travel`, `steering_sign`, `steering_scale`, `not_checked`.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,6 +28,7 @@ from slipid.data.check.columns import (
     exchanged,
     misordered,
 )
+from slipid.data.check.exchanged_wheels import exchanged_wheels
 from slipid.data.check.findings import (
     LEAST_PATH_M,
     LEAST_TURN_RAD,
@@ -62,8 +64,8 @@ from slipid.data.check.ratios import (
     ticks_per_radian,
     without_factor,
 )
-from slipid.data.check.stuck import stuck_channels
 from slipid.data.check.steered import steered_findings
+from slipid.data.check.stuck import stuck_channels
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import MOVED_M
 from slipid.model.geometry import Geometry
@@ -228,6 +230,9 @@ def _compared(
     # determine the heading beyond half a turn, so that correct runs may seem to disagree.
     half_sine = meant.convention.heading == "half_sine"
     alone = () if half_sine else tuple(single_runs(data, agreeing))
+    if not found and (swapped := exchanged_wheels(data.names, at, moved, evidence)) is not None:
+        others = replace(agreeing, judged=agreeing.judged & ~swapped[1])
+        alone = (swapped[0], *single_runs(data, others))
     listed = (*_of_lag(lag), *map(mistake_finding, found), *alone)
     return _Compared(listed, moved, evidence, meant, True)
 

@@ -13,10 +13,11 @@ sensor nor the effective track are known before a calibration.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from slipid.data.check.findings import LEAST_PATH_M, ROUNDING_M, ROUNDING_RAD, Finding, Severity
 from slipid.data.check.joined import (
+    ChannelIncrements,
     PoseConvention,
     body_motion,
     edges,
@@ -29,10 +30,15 @@ from slipid.model.geometry import Geometry
 STILL_SHARE = 0.01
 """A wheel stands still in a run if the range of its angle is below this share of the largest range
 of a wheel, which allows for an encoder that flickers by a tick [1]."""
-EXPECTED_SHARE = 0.5
+EXPECTED_SHARE = {True: 0.4, False: 0.5}
 """An encoder is stuck if the poses move the rim of its wheel by more than this share of the travel
-of the wheel that turns most. The share of a wheel on whose axle an omni robot drives stays below
-0.3 with a marker that is rotated by 15 deg, and slip only shortens the poses' motion [1]."""
+of the wheel that turns most [1], for robots whose wheels determine the twist and for others. A
+wheel on whose axle an omni robot drives has a share of up to 0.08 in real runs, and of 0.3 with a
+marker that is rotated by 15 deg. One side of a skid-steer robot that turns about it slips by up to
+0.42 on real grass."""
+COMMANDED_SHARE = 0.1
+"""A wheel is commanded to stand still if it is to turn by less than this share of the wheel that is
+to turn most [1]."""
 LEVER_BASES = 2.0
 """Largest change of the lever of a wheel, in base radii: one for a pose sensor at the edge of the
 robot, one for the effective track of a skid-steer robot, up to twice the track [1]."""
@@ -56,15 +62,21 @@ def stuck_channels(
     span = np.array([np.ptp(np.cumsum(rim[part], axis=0), axis=0) for part in parts])
     most = span.max(axis=1, initial=0.0)
     still = (span < STILL_SHARE * most[:, None]) & (most > LEAST_PATH_M)[:, None]
+    always = still[most > LEAST_PATH_M].all(axis=0) & still.any(axis=0)
     expected = np.full(still.shape, np.nan)
     for run in np.flatnonzero(still.any(axis=1)).tolist():
         path = _expected(body[parts[run]], rim[parts[run]], geometry)
+        if np.isnan(path).all() and not geometry.determines_twist:
+            path = np.full(len(path), _beyond_circle(runs, run, geometry))
+        if geometry.determines_twist and still[run].sum() > 1:  # such as two mecanum wheels
+            path = np.where(always, path, 0.0)
+        path = np.where(_commanded_to_stand(moved, parts[run], geometry), 0.0, path)
         expected[run] = np.where(still[run], path, np.nan)
     stuck = _frozen(runs, geometry, [rim[part] for part in parts])
     found = [_positions_constant(runs, stuck)] if stuck.any() else []
     for wheel in range(still.shape[1]):
         which, path = still[:, wheel], expected[:, wheel]
-        every = which.any() and bool(which[most > LEAST_PATH_M].all())
+        every = bool(always[wheel])
         if not (path > 0).any():
             if every and np.isnan(path).all():
                 found.append(_never_turns(runs, wheel, float(most.max()), geometry))
@@ -99,7 +111,37 @@ def _expected(
         along = ahead * x + left * y
         least = np.clip(-(along @ turn) / squares, lever - slack, lever + slack)
         out[wheel] = np.abs(along + least * turn).sum()
-    return np.where(out > EXPECTED_SHARE * travel.max(), out, 0.0)
+    share = EXPECTED_SHARE[geometry.determines_twist]
+    return np.where(out > share * travel.max(), out, 0.0)
+
+
+def _commanded_to_stand(
+    moved: ChannelIncrements, steps: Int[np.ndarray, " step"], geometry: Geometry
+) -> Bool[np.ndarray, " wheel"]:
+    """Return which wheels are commanded to stand still in some steps, while others are to turn.
+
+    On a slippery floor, poses alone may seem to move a wheel that rightly stands still.
+    """
+    if moved.commanded is not None:
+        commanded = float(geometry.wheel_radius) * moved.commanded[steps]
+    elif moved.twist is not None:
+        commanded = moved.twist[steps] @ np.asarray(geometry.forward()).T
+    else:
+        return np.zeros(moved.wheels.shape[1], bool)
+    path = np.abs(np.nan_to_num(commanded)).sum(axis=0)
+    return (path < COMMANDED_SHARE * path.max()) & (path.max() > LEAST_PATH_M)
+
+
+def _beyond_circle(runs: Runs, run: int, geometry: Geometry) -> float:
+    """Return the range of the positions in a run [m], nan if a robot that turns may stay in it.
+
+    The pose sensor of a robot that turns about a wheel stays on a circle around this wheel.
+    """
+    place = runs.pose[runs.rows(run), :2]
+    place = place[np.isfinite(place).all(axis=1)]
+    extent = float(np.hypot(*np.ptp(place, axis=0))) if len(place) else 0.0
+    circle = 2.0 * (1.0 + LEVER_BASES) * float(geometry.base_radius)
+    return extent if extent > np.sqrt(2) * circle else np.nan
 
 
 def _frozen(
