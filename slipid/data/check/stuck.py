@@ -36,12 +36,15 @@ of the wheel that turns most [1], for robots whose wheels determine the twist an
 wheel on whose axle an omni robot drives has a share of up to 0.08 in real runs, and of 0.3 with a
 marker that is rotated by 15 deg. One side of a skid-steer robot that turns about it slips by up to
 0.42 on real grass."""
-COMMANDED_SHARE = 0.1
-"""A wheel is commanded to stand still if it is to turn by less than this share of the wheel that is
-to turn most [1]."""
-LEVER_BASES = 2.0
+CONFIRMED_SHARE = 0.2
+"""The same share for a wheel that is commanded to turn [1]."""
+COMMANDED_SHARES = 0.1, 0.3
+"""A wheel is commanded to stand still if it is to turn by less than the first share of the wheel
+that is to turn most, and commanded to turn above the second one [1]."""
+LEVER_BASES = {True: 1.0, False: 2.0}
 """Largest change of the lever of a wheel, in base radii: one for a pose sensor at the edge of the
-robot, one for the effective track of a skid-steer robot, up to twice the track [1]."""
+robot, and one for robots whose wheels do not determine the twist, because of their effective track,
+which is up to twice the track [1]."""
 TRANSLATION_SHARE = 0.5
 """Least translation computed from the wheels over their rotation, as an arc at the base radius, for
 a judgement of constant positions; in a turn on the spot unequal wheels cause less [1]."""
@@ -65,12 +68,12 @@ def stuck_channels(
     always = still[most > LEAST_PATH_M].all(axis=0) & still.any(axis=0)
     expected = np.full(still.shape, np.nan)
     for run in np.flatnonzero(still.any(axis=1)).tolist():
-        path = _expected(body[parts[run]], rim[parts[run]], geometry)
+        least = _least_share(moved, parts[run], geometry)
+        path = _expected(body[parts[run]], rim[parts[run]], least, geometry)
         if np.isnan(path).all() and not geometry.determines_twist:
             path = np.full(len(path), _beyond_circle(runs, run, geometry))
-        if geometry.determines_twist and still[run].sum() > 1:  # such as two mecanum wheels
+        if still[run].sum() > 1 and _stand_together(still[run], geometry):
             path = np.where(always, path, 0.0)
-        path = np.where(_commanded_to_stand(moved, parts[run], geometry), 0.0, path)
         expected[run] = np.where(still[run], path, np.nan)
     stuck = _frozen(runs, geometry, [rim[part] for part in parts])
     found = [_positions_constant(runs, stuck)] if stuck.any() else []
@@ -89,12 +92,15 @@ def stuck_channels(
 
 
 def _expected(
-    body: Float[np.ndarray, "step 3"], rim: Float[np.ndarray, "step wheel"], geometry: Geometry
+    body: Float[np.ndarray, "step 3"],
+    rim: Float[np.ndarray, "step wheel"],
+    least: Float[np.ndarray, " wheel"],
+    geometry: Geometry,
 ) -> Float[np.ndarray, " wheel"]:
     """Return by how far the body moves the rim of each wheel in a run [m].
 
     The path is a sum over parts in which the wheel that turns most travels `LEAST_PATH_M`, since
-    the noise of poses would add up over steps. It is 0 below `EXPECTED_SHARE` of that travel, and
+    the noise of poses would add up over steps. It is 0 below the `least` share of that travel, and
     nan if the motion of the body is not known.
     """
     known = np.isfinite(body).all(axis=1)
@@ -105,31 +111,44 @@ def _expected(
     turned = np.cumsum(np.abs(rim[:, np.argmax(travel)]))
     _, part = np.unique(turned // LEAST_PATH_M, return_inverse=True)
     x, y, turn = (np.bincount(part, column) for column in body.T)
-    slack, squares = LEVER_BASES * float(geometry.base_radius), max(float(turn @ turn), 1e-300)
+    slack = LEVER_BASES[geometry.determines_twist] * float(geometry.base_radius)
+    squares = max(float(turn @ turn), 1e-300)
     out = np.zeros(rim.shape[1])
     for wheel, (ahead, left, lever) in enumerate(np.asarray(geometry.forward())):
         along = ahead * x + left * y
-        least = np.clip(-(along @ turn) / squares, lever - slack, lever + slack)
-        out[wheel] = np.abs(along + least * turn).sum()
-    share = EXPECTED_SHARE[geometry.determines_twist]
-    return np.where(out > share * travel.max(), out, 0.0)
+        lever = np.clip(-(along @ turn) / squares, lever - slack, lever + slack)
+        out[wheel] = np.abs(along + lever * turn).sum()
+    return np.where(out > least * travel.max(), out, 0.0)
 
 
-def _commanded_to_stand(
+def _least_share(
     moved: ChannelIncrements, steps: Int[np.ndarray, " step"], geometry: Geometry
-) -> Bool[np.ndarray, " wheel"]:
-    """Return which wheels are commanded to stand still in some steps, while others are to turn.
+) -> Float[np.ndarray, " wheel"]:
+    """Return the share of travel above which each wheel must turn in some steps [1].
 
-    On a slippery floor, poses alone may seem to move a wheel that rightly stands still.
+    It is infinite for a wheel that is commanded to stand still, since a slipping body may move it.
     """
+    least = np.full(moved.wheels.shape[1], EXPECTED_SHARE[geometry.determines_twist])
     if moved.commanded is not None:
         commanded = float(geometry.wheel_radius) * moved.commanded[steps]
     elif moved.twist is not None:
         commanded = moved.twist[steps] @ np.asarray(geometry.forward()).T
     else:
-        return np.zeros(moved.wheels.shape[1], bool)
+        return least
     path = np.abs(np.nan_to_num(commanded)).sum(axis=0)
-    return (path < COMMANDED_SHARE * path.max()) & (path.max() > LEAST_PATH_M)
+    if path.max() > LEAST_PATH_M:
+        stands, turns = (path < share * path.max() for share in COMMANDED_SHARES)
+        least[~turns], least[stands] = CONFIRMED_SHARE, np.inf
+    return least
+
+
+def _stand_together(still: Bool[np.ndarray, " wheel"], geometry: Geometry) -> bool:
+    """Return whether a robot that goes sideways may rightly drive while some wheels stand still.
+
+    All of them stand still in one direction of travel, as two of four mecanum wheels do.
+    """
+    across = np.asarray(geometry.forward())[still, :2]
+    return geometry.determines_twist and int(np.linalg.matrix_rank(across, tol=1e-3)) < 2
 
 
 def _beyond_circle(runs: Runs, run: int, geometry: Geometry) -> float:
@@ -140,7 +159,7 @@ def _beyond_circle(runs: Runs, run: int, geometry: Geometry) -> float:
     place = runs.pose[runs.rows(run), :2]
     place = place[np.isfinite(place).all(axis=1)]
     extent = float(np.hypot(*np.ptp(place, axis=0))) if len(place) else 0.0
-    circle = 2.0 * (1.0 + LEVER_BASES) * float(geometry.base_radius)
+    circle = 2.0 * (1.0 + LEVER_BASES[False]) * float(geometry.base_radius)
     return extent if extent > np.sqrt(2) * circle else np.nan
 
 
