@@ -1,5 +1,6 @@
 """Logs that tell little, or that contradict the config, are answered by a sentence each."""
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -153,6 +154,88 @@ def test_permuted_wheels_are_named_whatever_the_radius(name, order, says, radius
     assert [f.kind for f in rest] == ([] if radius > 1 else ["wheel_scale"])
     assert all("correct wheel_radius_m in [robot]" in (f.remedy or "") for f in rest)
     assert f"list the columns in the order {says} " in (first.remedy or "")
+
+
+def dead(columns: Columns, run: int, which: tuple[int, ...] = (0, 1)) -> Columns:
+    name = next(n for n in columns if n in ("right", "wheel2"))
+    stopped = {name: np.full_like(columns[name], columns[name][0])}
+    return columns | (stopped if run in which else {})
+
+
+@pytest.mark.parametrize("name", ["diff_umbmark", "omni3_right", "ackermann_car"])
+def test_an_encoder_that_never_counts_is_named_with_its_column(name):
+    robot = replace(NAMED[name], runs=2)
+    (found,) = alarms(task_of(robot, dead))
+    assert (found.kind, found.severity, found.runs) == ("wheel_constant", "wrong", ())
+    column = "wheel2" if robot.drive == "omni" else "right"
+    assert found.found.startswith(f"wheel 2 (column '{column}') never turns in 2 of 2 runs, while")
+    (one,) = alarms(task_of(robot, lambda columns, run: dead(columns, run, (1,))))
+    assert (one.kind, one.severity, len(one.runs)) == ("wheel_constant", "wrong", 1)
+    assert "never turns in 1 of 2 runs" in one.found
+
+
+def test_without_headings_an_encoder_is_dead_where_the_robot_leaves_a_circle():
+    far, near = replace(SQUARES, pose_kind="xy"), replace(SQUARES, pose_kind="xy", nominal_base=9.0)
+    (found,) = alarms(task_of(far, lambda columns, run: dead(columns, run, (1,))))
+    assert (found.kind, found.runs) == ("wheel_constant", ("floor/1.csv",))
+    assert alarms(task_of(near, lambda columns, run: dead(columns, run, (1,)))) == []
+    (found,) = alarms(task_of(near, dead))
+    assert found.found.startswith("wheel 2 (column 'right') turns in no run, while other wheels")
+    assert found.severity == "wrong"
+
+
+def turning_about(columns: Columns, run: int) -> Columns:
+    """Columns of a robot that turns about its right wheel, with a marker to the right of it."""
+    angle = np.linspace(0.0, 5.0, len(columns["t"]))
+    side = -0.5 * SQUARES.nominal_base
+    x, y = side * np.array([np.sin(angle), 1 - np.cos(angle)])
+    ticks = np.round(angle * SQUARES.nominal_base / SQUARES.nominal_radius / math.tau * 4096)
+    noise = np.random.default_rng(run).normal(size=(3, len(angle))) * 0.001
+    pose = {"x": x + noise[0], "y": y + noise[1], "heading": angle + noise[2]}
+    return columns | pose | {"left": -ticks, "right": 0 * ticks}
+
+
+def on_the_spot(columns: Columns, run: int) -> Columns:
+    """Columns of a robot that turns on the spot, without noise, on unequal wheels."""
+    angle = np.linspace(0.0, 9.0, len(columns["t"]))
+    rim = 0.5 * angle * SQUARES.nominal_base / SQUARES.nominal_radius / math.tau * 4096
+    pose = {"x": 0 * angle, "y": 0 * angle, "heading": angle}
+    return columns | pose | {"left": np.round(-0.95 * rim), "right": np.round(1.05 * rim)}
+
+
+@pytest.mark.parametrize("how", [turning_about, on_the_spot])
+def test_wheels_and_positions_that_rightly_stand_still_are_not_named(how):
+    found = alarms(task_of(SQUARES, lambda columns, run: how(columns, run) if run else columns))
+    assert found == []
+
+
+def test_frozen_positions_are_named_although_the_heading_goes_on():
+    def frozen(columns: Columns, run: int) -> Columns:
+        return columns | ({a: 0 * columns[a] + 0.5 for a in "xy"} if run == 1 else {})
+
+    for robot in (SQUARES, STEERED):
+        (found,) = alarms(task_of(robot, frozen))
+        assert (found.kind, found.severity) == ("position_constant", "wrong")
+        assert len(found.runs) == 1
+        assert "x and y of the poses never change in 1 of 2 runs" in found.found
+
+
+def test_wheels_exchanged_in_one_run_are_named():
+    def swapped(columns: Columns, run: int) -> Columns:
+        return columns | ({"left": columns["right"], "right": columns["left"]} if run else {})
+
+    (found,) = alarms(task_of(MIXED, swapped))
+    assert (found.kind, found.severity, found.runs) == (
+        "wheels_exchanged",
+        "wrong",
+        ("floor/1.csv",),
+    )
+    assert (
+        "the poses of 1 of 2 runs follow their wheels only with two columns exchanged"
+        in found.found
+    )
+    assert "with wheels 1 and 2 exchanged" in found.found
+    assert alarms(task_of(STRAIGHT, swapped)) == []
 
 
 def test_without_a_turn_the_order_of_two_wheels_is_not_judged():

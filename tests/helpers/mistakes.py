@@ -128,6 +128,15 @@ def _one_constant(raws: Raws) -> Raws:
     return [replace(raws[0], pose=0 * raws[0].pose + raws[0].pose[0]), *raws[1:]]
 
 
+def _dead(values: np.ndarray) -> np.ndarray:
+    """The columns with that of the second wheel constant."""
+    return np.where(np.arange(values.shape[1]) == 1, values[:1], values)
+
+
+def _in_one(change: Callable[[Raws], Raws]) -> Callable[[Raws], Raws]:
+    return lambda raws: [*change(raws[:1]), *raws[1:]]
+
+
 def _from_speed(factor: float) -> Callable[[Raws], Raws]:
     """The angle is the integral of the reported speed, which has a wrong unit."""
 
@@ -328,5 +337,19 @@ MISTAKES = (
     ),
     Mistake(
         "sign of a commanded wheel", ("command_sign",), "commanded", _wheels(_signed(1), "command")
+    ),
+    Mistake("dead encoder", ("wheel_constant",), "encoder", _wheels(_dead)),
+    Mistake("dead encoder in one run", ("wheel_constant",), "exclude", _in_one(_wheels(_dead))),
+    Mistake(
+        "frozen positions in one run",
+        ("position_constant",),
+        "exclude",
+        _in_one(_pose(lambda x, y, a: (0 * x, 0 * y, a))),
+    ),
+    Mistake(
+        "wheels 1 and 2 exchanged in one run",
+        ("wheels_exchanged",),
+        "exchange the columns",
+        _in_one(_wheels(_ordered([1, 0, 2, 3]), "angle", "speed", "command")),
     ),
 )

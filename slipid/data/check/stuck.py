@@ -7,7 +7,8 @@ along its axle. Its encoder is stuck only if the poses move the rim r of the whe
 
 where d is the drive direction of the wheel. The factor c is its lever in the config, changed by up
 to `LEVER_BASES` base radii such that r is as small as possible, since neither the place of the pose
-sensor nor the effective track are known before a calibration.
+sensor nor the effective track are known before a calibration. A wheel that is commanded to turn is
+judged with the lever as it is, and one that is commanded to stand still is not judged.
 """
 
 from collections.abc import Sequence
@@ -36,9 +37,9 @@ of the wheel that turns most [1], for robots whose wheels determine the twist an
 wheel on whose axle an omni robot drives has a share of up to 0.08 in real runs, and of 0.3 with a
 marker that is rotated by 15 deg. One side of a skid-steer robot that turns about it slips by up to
 0.42 on real grass."""
-CONFIRMED_SHARE = 0.2
+CONFIRMED_SHARE = 0.15
 """The same share for a wheel that is commanded to turn [1]."""
-COMMANDED_SHARES = 0.1, 0.3
+COMMANDED_SHARES = 0.1, 0.2
 """A wheel is commanded to stand still if it is to turn by less than the first share of the wheel
 that is to turn most, and commanded to turn above the second one [1]."""
 LEVER_BASES = {True: 1.0, False: 2.0}
@@ -116,7 +117,8 @@ def _expected(
     out = np.zeros(rim.shape[1])
     for wheel, (ahead, left, lever) in enumerate(np.asarray(geometry.forward())):
         along = ahead * x + left * y
-        lever = np.clip(-(along @ turn) / squares, lever - slack, lever + slack)
+        if least[wheel] > CONFIRMED_SHARE:
+            lever = np.clip(-(along @ turn) / squares, lever - slack, lever + slack)
         out[wheel] = np.abs(along + lever * turn).sum()
     return np.where(out > least * travel.max(), out, 0.0)
 

@@ -3,7 +3,8 @@
 A fit is trusted if the model that was selected on each floor predicts held-out runs no worse than
 any simpler model, the lengths of the config included, but for a tenth and .1 % of the path, and has
 physically plausible parameters. The force balance must also have converged, if it was selected on
-some floor.
+some floor. Calibrated lengths that predict far worse than the config's make a fit doubtful even
+where they are not selected, since some runs must contradict the others.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -23,6 +24,10 @@ WORDS: tuple[Word, ...] = ("trusted", "doubtful", "not to be trusted")
 WORSE_RATIO, WORSE_ERROR = 1.1, 0.001
 """The selected model is worse than a simpler one if its error exceeds that of the simpler one by
 more than this factor, and by more than this error over the path length [1]."""
+FAR_WORSE_RATIO = 1.5
+"""Calibrated lengths that are not selected are far worse than the config's if their error exceeds
+that of the config's by more than this factor, and by `WORSE_ERROR` [1]; with three correct runs
+of a robot whose lengths are as in the config it exceeds it by less."""
 USELESS_ERROR = 0.5
 """Error over the path length above which a model is useless [1]."""
 MANY_AT_BOUNDS = 3
@@ -134,6 +139,14 @@ def _of_errors(floors: Mapping[str, FloorSelection]) -> Iterator[_Reason]:
                     f"on {name} {floor.model} is off by {100 * own:.2f} % of the path, and the "
                     f"simpler {other} by {100 * error:.2f} %",
                 )
+        plain, fitted = (floor.errors.get(name, np.nan) for name in ("nominal", "calibrated"))
+        worse = fitted > FAR_WORSE_RATIO * plain and fitted > plain + WORSE_ERROR
+        if worse and floor.model != "calibrated":
+            yield (
+                1,
+                f"on {name} the calibrated lengths are off by {100 * fitted:.2f} % of the path, "
+                f"and the config's by {100 * plain:.2f} %: some runs contradict the others",
+            )
         if own > USELESS_ERROR:
             yield (
                 2,

@@ -56,6 +56,20 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
             "not to be trusted",
             "which is useless",
         ),
+        (
+            {"ice": floor(nominal=0.02, calibrated=0.08, contact=0.01)},
+            True,
+            [number()],
+            "doubtful",
+            "on ice the calibrated lengths are off by 8.00 % of the path, and the config's by 2.00",
+        ),
+        (
+            {"ice": floor(model="nominal", nominal=0.02, calibrated=0.08)},
+            True,
+            [],
+            "doubtful",
+            "some runs contradict the others",
+        ),
         ({"a": floor(contact=float("nan"))}, True, [number()], "not to be trusted", "not finite"),
         (
             {"a": floor(held_out=False, nominal=0.1, contact=0.01)},

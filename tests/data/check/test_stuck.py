@@ -1,0 +1,61 @@
+"""A wheel that rightly stands still on a slippery floor is not said to have a dead encoder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slipid.data.check.stuck import stuck_channels
+from tests.helpers.plain_robot import MECANUM, OMNI, as_runs, drive
+
+SPEED = 0.3
+
+
+def straight(robot, direction, drift, *less):
+    """Two runs straight ahead in a direction [rad], with a body that slips to the left of it."""
+    raws = []
+    for raw in drive(robot, runs=2):
+        way = SPEED * raw.time
+        c, s = np.cos(direction), np.sin(direction)
+        turns = np.array([c, s, 0.0]) @ robot.rolling.T
+        pose = np.stack([c * way - s * drift * way, s * way + c * drift * way, 0 * way], axis=1)
+        pose += np.random.default_rng(0).normal(0, [0.002, 0.002, 0.005], pose.shape)
+        twist = SPEED * np.array([c, s, 0.0]) * np.ones((len(way), 1))
+        command = SPEED * turns * np.ones((len(way), 1))
+        moved = replace(raw, angle=np.outer(way, turns), pose=pose, twist=twist, command=command)
+        raws.append(moved.less(*less))
+    return raws
+
+
+def kinds(raws, robot):
+    found, useless = stuck_channels(as_runs(raws), robot.geometry)
+    assert bool(found) == useless.any()
+    return [finding.kind for finding in found]
+
+
+def test_a_wheel_on_whose_axle_the_robot_drives_stands_still():
+    assert kinds(straight(OMNI, 0.0, 0.2, "command", "twist"), OMNI) == []
+
+
+@pytest.mark.parametrize("less", ["command", "twist"])
+def test_a_wheel_that_is_commanded_to_stand_still_may_be_dragged(less):
+    """Slip as strong as this looks like a dead encoder without a command."""
+    assert kinds(straight(OMNI, 0.0, 0.8, less), OMNI) == []
+    assert kinds(straight(OMNI, 0.0, 0.8, "command", "twist"), OMNI) == ["wheel_constant"]
+
+
+def test_two_mecanum_wheels_may_stand_still_together():
+    along, ahead = (straight(MECANUM, a, 0.8, "command", "twist") for a in (0.25 * np.pi, 0.0))
+    assert kinds([*along, *ahead], MECANUM) == []
+
+
+@pytest.mark.parametrize("less", [("command", "twist"), ("command",), ("twist",)])
+def test_a_command_confirms_that_a_wheel_should_turn(less):
+    """Without a command a slow wheel beside faster ones may stand still by slip."""
+    (_, slow, *_), direction = OMNI.rolling[:, :2], np.radians(20.0)
+    assert abs(slow @ [np.cos(direction), np.sin(direction)]) > 0
+    raws = straight(OMNI, direction, 0.0, *less)
+    raws = [replace(raw, angle=raw.angle * [1.0, 0.0, 1.0]) for raw in raws]
+    assert kinds(raws, OMNI) == ([] if len(less) > 1 else ["wheel_constant"])
