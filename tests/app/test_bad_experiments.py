@@ -185,9 +185,9 @@ def test_without_headings_an_encoder_is_dead_where_the_robot_leaves_a_circle():
 
 
 def turning_about(columns: Columns, run: int) -> Columns:
-    """Columns of a robot that turns about its right wheel, with a marker to the right of it."""
+    """Columns of a robot that turns about its right wheel, with a marker beside the left one."""
     angle = np.linspace(0.0, 5.0, len(columns["t"]))
-    side = -0.5 * SQUARES.nominal_base
+    side = -1.2 * SQUARES.nominal_base
     x, y = side * np.array([np.sin(angle), 1 - np.cos(angle)])
     ticks = np.round(angle * SQUARES.nominal_base / SQUARES.nominal_radius / math.tau * 4096)
     noise = np.random.default_rng(run).normal(size=(3, len(angle))) * 0.001

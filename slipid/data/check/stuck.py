@@ -166,7 +166,7 @@ def _beyond_circle(runs: Runs, run: int, geometry: Geometry) -> float:
 
 
 def _frozen(
-    runs: Runs, geometry: Geometry, rim: Sequence[Float[np.ndarray, "step wheel"]]
+    runs: Runs, geometry: Geometry, rim: Sequence[Float[np.ndarray, "_ wheel"]]
 ) -> Bool[np.ndarray, " run"]:
     """Return, for each run, whether x and y are constant although its wheels drive the robot on.
 
