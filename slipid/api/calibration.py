@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from slipid.api.fit import Numbers, Prior, fit_task_of
 from slipid.app.calibrate import CalibrationResult, calibration_of
 from slipid.data.check.columns import refuse_misordered
+from slipid.data.check.stuck import refuse_stuck
 from slipid.data.runs import Runs
 from slipid.deploy.deploy import calibrated_robot
 from slipid.fitting.calibration.result import Calibration
@@ -73,12 +74,14 @@ def calibrate(
         quiet: True to report no progress.
 
     Raises:
-        DataError: no wheel turns, or columns of wheels are exchanged.
+        DataError: no wheel turns, columns of wheels are exchanged, or an
+            encoder or the positions stay constant while the robot moves.
         ValueError: there is no such parameter, or a value is outside its bounds.
 
     Source: `slipid.fitting.calibration.estimate`.
     """
     refuse_misordered(runs.logs)
+    refuse_stuck(runs, robot.geometry)
     task = fit_task_of(runs, robot, priors or {}, fixed or {}, {}, ())
     with Reporter(quiet=quiet) as report:
         return RobotCalibration(calibration_of(task, report))

@@ -10,6 +10,7 @@ from slipid.app.config import FitSection
 from slipid.app.identify import fitted
 from slipid.app.problem import FitTask, of_torques, robot_for_runs, stated_sizes
 from slipid.data.check.columns import refuse_misordered
+from slipid.data.check.stuck import refuse_stuck
 from slipid.data.runs import Runs
 from slipid.fitting.problem import fixed_viscosities
 from slipid.infer.result import Fit
@@ -72,12 +73,14 @@ def fit(
         quiet: True to report no progress.
 
     Raises:
-        DataError: the runs cannot be divided into windows, or columns of wheels are exchanged.
+        DataError: the runs cannot be divided into windows, columns of wheels are exchanged, or an
+            encoder or the positions stay constant while the robot moves.
         ValueError: there is no such parameter, or a value is outside its bounds.
 
     Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.fitting`.
     """
     refuse_misordered(runs.logs)
+    refuse_stuck(runs, robot.geometry)
     chosen = priors or {}, fixed or {}, start or {}, free
     task = fit_task_of(runs, robot, *chosen, image_centre, windows_per_piece, seed)
     task = replace(task, settings=task.settings.model_copy(update={"intervals": intervals}))

@@ -16,7 +16,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.data.check.findings import LEAST_PATH_M, ROUNDING_M, ROUNDING_RAD, Finding, Severity
+from slipid.data.check.findings import (
+    LEAST_PATH_M,
+    ROUNDING_M,
+    ROUNDING_RAD,
+    Finding,
+    Severity,
+    wrong,
+)
 from slipid.data.check.joined import (
     ChannelIncrements,
     PoseConvention,
@@ -27,6 +34,7 @@ from slipid.data.check.joined import (
 )
 from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
+from slipid.support.errors import DataError
 
 STILL_SHARE = 0.01
 """A wheel stands still in a run if the range of its angle is below this share of the largest range
@@ -90,6 +98,15 @@ def stuck_channels(
         found.append(_wheel_constant(runs, wheel, which, float(np.nanmax(path))))
         stuck |= which | every
     return tuple(found), stuck
+
+
+def refuse_stuck(runs: Runs, geometry: Geometry) -> None:
+    """Raise `DataError` with all findings of `stuck_channels` that forbid a fit, if there are any.
+
+    Functions that do not run the whole check call it.
+    """
+    if listed := "\n".join(f"logs not used: {f}" for f in wrong(stuck_channels(runs, geometry)[0])):
+        raise DataError(listed)
 
 
 def _expected(

@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slipid.api.calibration import calibrate
 from slipid.data.check.stuck import stuck_channels
+from slipid.model.robot import Robot
+from slipid.support.errors import DataError
 from tests.helpers.plain_robot import MECANUM, OMNI, as_runs, drive
 
 SPEED = 0.3
@@ -25,7 +28,7 @@ def straight(robot, direction, drift, *less):
         twist = SPEED * np.array([c, s, 0.0]) * np.ones((len(way), 1))
         command = SPEED * turns * np.ones((len(way), 1))
         moved = replace(raw, angle=np.outer(way, turns), pose=pose, twist=twist, command=command)
-        raws.append(moved.less(*less))
+        raws.append(moved.less("speed", *less))
     return raws
 
 
@@ -59,3 +62,10 @@ def test_a_command_confirms_that_a_wheel_should_turn(less):
     raws = straight(OMNI, direction, 0.0, *less)
     raws = [replace(raw, angle=raw.angle * [1.0, 0.0, 1.0]) for raw in raws]
     assert kinds(raws, OMNI) == ([] if len(less) > 1 else ["wheel_constant"])
+
+
+def test_calibrate_refuses_a_dead_encoder():
+    good, bad = straight(OMNI, 0.5 * np.pi, 0.0, "command", "twist")
+    raws = [good, replace(bad, angle=bad.angle * [1.0, 0.0, 1.0])]
+    with pytest.raises(DataError, match=r"wheel 2 never turns in 1 of 2 runs.*run_01.csv"):
+        calibrate(as_runs(raws), Robot.of(OMNI.geometry), quiet=True)
