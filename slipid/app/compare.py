@@ -27,6 +27,7 @@ from slipid.app.problem import (
 )
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.check.findings import by_reason
+from slipid.data.check.stuck import refuse_stuck
 from slipid.data.runs import Runs
 from slipid.data.windows import steady_duration
 from slipid.fitting.calibration.estimate import calibrate
@@ -78,6 +79,7 @@ def compare(
     config = read_config(config_path)
     read = task = with_mixed(read_fit_task(config, data, report), data, report)
     refuse_misordered(task.logs)
+    refuse_stuck(task.dataset, task.robot.geometry)
     folds_by_question = {name: folds_of(task.dataset, name) for name in dict.fromkeys(questions)}
     for name in [name for name, fold in folds_by_question.items() if (fold < 0).all()]:
         report.line(f"skipped: {name}: no floor has runs in two folds")
