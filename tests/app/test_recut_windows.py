@@ -81,7 +81,7 @@ def test_chains_are_of_windows_and_choices_as_the_fit_has_them(monkeypatch, tmp_
     fit = SimpleNamespace(
         robot="the robot of the fit", choices="those of its calibration, too", mixed=None
     )
-    nothing = ("log_folder", "_refuse_other_logs", "read_config")
+    nothing = ("log_folder", "_refuse_other_logs", "config_of_fit")
     for name in nothing:
         monkeypatch.setattr(sample, name, lambda *_: None)
     monkeypatch.setattr(sample, "load", lambda _: fit)
