@@ -37,7 +37,7 @@ from slipid.support.progress import Reporter
 HERE = Path(__file__).resolve().parent
 DIGITS = 6
 """Significant digits of the numbers in the files."""
-_WORST_FIRST = ("not_identified", "weak", "identified")
+WORST_FIRST = ("not_identified", "weak", "identified")
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def _calibrated(
     several = given if isinstance(given, list) else [given]
     value = tuple(_short(factor * one["value"]) for one in several)
     ends = tuple(_pair([factor * end for end in one["interval90"]]) for one in several)
-    verdict = min((one["verdict"] for one in several), key=_WORST_FIRST.index)
+    verdict = min((one["verdict"] for one in several), key=WORST_FIRST.index)
     return ReferenceNumber(
         value if several is given else value[0],
         unit or several[0]["unit"],
