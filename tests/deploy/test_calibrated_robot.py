@@ -97,7 +97,7 @@ def test_another_part_than_the_calibration_is_refused(calibrated):
 def test_a_whole_fit_is_not_overwritten_by_a_calibration(calibrated, tmp_path):
     """Files of two results in one folder would contradict each other."""
     folder = calibrated[0]
-    (tmp_path / "fit.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "fit.json").write_text('{"schema": "slipid.fit/1"}', encoding="utf-8")
     words = ("identify", folder / "robot.toml", "--data", folder / "logs", "--out", tmp_path)
     done = invoke(*words, "--only", "calibration", "--quiet")
     assert done.exit_code == 2
