@@ -17,9 +17,11 @@ from slipid.data.check.joined import (
     ChannelIncrements,
     PoseConvention,
     StepEdges,
+    aligned,
     body_motion,
     products,
 )
+from slipid.model.geometry import Geometry
 
 LEAST_REDUCTION = 0.12
 """Least reduction by an exchange of the unexplained fraction of the motion of a run [1]. It is at
@@ -30,7 +32,11 @@ whose poses do not belong to the wheels at all are not explained by any exchange
 
 
 def exchanged_wheels(
-    names: tuple[str, ...], at: StepEdges, moved: ChannelIncrements, evidence: Evidence
+    names: tuple[str, ...],
+    at: StepEdges,
+    moved: ChannelIncrements,
+    evidence: Evidence,
+    geometry: Geometry,
 ) -> tuple[Finding, Bool[np.ndarray, " run"]] | None:
     """Return the finding about runs with exchanged columns, and these runs; None without any.
 
@@ -39,8 +45,9 @@ def exchanged_wheels(
         at: steps of the runs.
         moved: increments of the robot's channels over the steps.
         evidence: evidence from all runs, in which order, signs and axes are as declared.
+        geometry: declared geometry of the robot.
     """
-    body = body_motion(at, PoseConvention())
+    body = aligned(body_motion(at, PoseConvention()), moved.wheels, geometry)
     before, after = np.zeros(len(names)), np.zeros(len(names))
     pairs = [(0, 0)] * len(names)
     for run in range(len(names)):

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from slipid.data.log import Log, WheelReading
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_increments, integral, interpolate
+from slipid.model.geometry import Geometry
 
 STEP_S = 0.4
 """Duration of a step [s]: long enough that jitter and rounding matter little, and short compared
@@ -262,6 +263,29 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
         turned = np.mod(turned + np.pi, 2 * np.pi) - np.pi
     after[:, 2] = before[:, 2] + turned
     return body_increments(before, after)
+
+
+def aligned(
+    body: Float[np.ndarray, "step 3"], wheels: Float[np.ndarray, "step wheel"], geometry: Geometry
+) -> Float[np.ndarray, "step 3"]:
+    """Return increments of the body without the rotation of the pose sensor on an omni robot.
+
+    The rotation, which a calibration finds later, turns the translation computed from the wheels
+    into that of the poses, on average over all steps. On robots that do not go sideways nothing is
+    changed, since a place of the sensor off the centre has the same effect as a rotation.
+
+    Args:
+        body: increments ahead [m], left [m] and of the heading [rad].
+        wheels: rotation of each wheel [rad].
+        geometry: declared geometry of the robot.
+    """
+    if not geometry.determines_twist:
+        return body
+    twist = float(geometry.wheel_radius) * wheels @ np.asarray(geometry.pseudo_inverse()).T
+    there, meant = (x[:, 0] + 1j * x[:, 1] for x in (body, twist))
+    angle = np.angle(np.nansum(there * meant.conj()))
+    turned = there * np.exp(-1j * angle)
+    return np.column_stack([turned.real, turned.imag, body[:, 2]])
 
 
 def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.ndarray, " step"]:

@@ -230,7 +230,8 @@ def _compared(
     # determine the heading beyond half a turn, so that correct runs may seem to disagree.
     half_sine = meant.convention.heading == "half_sine"
     alone = () if half_sine else tuple(single_runs(data, agreeing))
-    if not found and (swapped := exchanged_wheels(data.names, at, moved, evidence)) is not None:
+    swapped = None if found else exchanged_wheels(data.names, at, moved, evidence, geometry)
+    if swapped is not None:
         others = replace(agreeing, judged=agreeing.judged & ~swapped[1])
         alone = (swapped[0], *single_runs(data, others))
     listed = (*_of_lag(lag), *map(mistake_finding, found), *alone)

@@ -7,8 +7,9 @@ along its axle. Its encoder is stuck only if the poses move the rim r of the whe
 
 where d is the drive direction of the wheel. The factor c is its lever in the config, changed by up
 to `LEVER_BASES` base radii such that r is as small as possible, since neither the place of the pose
-sensor nor the effective track are known before a calibration. A wheel that is commanded to turn is
-judged with the lever as it is, and one that is commanded to stand still is not judged.
+sensor nor the effective track are known before a calibration; nor is the rotation of the sensor,
+which is removed on robots that go sideways. A wheel that is commanded to turn is judged with lever
+and poses as they are, and one that is commanded to stand still is not judged.
 """
 
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ from slipid.data.check.findings import (
 from slipid.data.check.joined import (
     ChannelIncrements,
     PoseConvention,
+    aligned,
     body_motion,
     edges,
     increments,
@@ -42,9 +44,8 @@ of a wheel, which allows for an encoder that flickers by a tick [1]."""
 EXPECTED_SHARE = {True: 0.4, False: 0.5}
 """An encoder is stuck if the poses move the rim of its wheel by more than this share of the travel
 of the wheel that turns most [1], for robots whose wheels determine the twist and for others. A
-wheel on whose axle an omni robot drives has a share of up to 0.08 in real runs, and of 0.3 with a
-marker that is rotated by 15 deg. One side of a skid-steer robot that turns about it slips by up to
-0.42 on real grass."""
+wheel on whose axle an omni robot drives has a share of up to 0.08 in real runs. One side of a
+skid-steer robot that turns about it slips by up to 0.42 on real grass."""
 CONFIRMED_SHARE = 0.15
 """The same share for a wheel that is commanded to turn [1]."""
 COMMANDED_SHARES = 0.1, 0.2
@@ -70,6 +71,7 @@ def stuck_channels(
     body = body_motion(at, PoseConvention())
     if moved.twist is not None:  # instead of poses that are not whole
         body = np.where(np.isfinite(body).all(axis=1)[:, None], body, moved.twist)
+    bodies = np.stack([body, aligned(body, moved.wheels, geometry)])
     parts = np.split(np.arange(len(rim)), np.flatnonzero(np.diff(at.run)) + 1)
     span = np.array([np.ptp(np.cumsum(rim[part], axis=0), axis=0) for part in parts])
     most = span.max(axis=1, initial=0.0)
@@ -78,7 +80,7 @@ def stuck_channels(
     expected = np.full(still.shape, np.nan)
     for run in np.flatnonzero(still.any(axis=1)).tolist():
         least = _least_share(moved, parts[run], geometry)
-        path = _expected(body[parts[run]], rim[parts[run]], least, geometry)
+        path = _expected(bodies[:, parts[run]], rim[parts[run]], least, geometry)
         if np.isnan(path).all() and not geometry.determines_twist:
             path = np.full(len(path), _beyond_circle(runs, run, geometry))
         if still[run].sum() > 1 and _stand_together(still[run], geometry):
@@ -110,7 +112,7 @@ def refuse_stuck(runs: Runs, geometry: Geometry) -> None:
 
 
 def _expected(
-    body: Float[np.ndarray, "step 3"],
+    bodies: Float[np.ndarray, "2 step 3"],
     rim: Float[np.ndarray, "step wheel"],
     least: Float[np.ndarray, " wheel"],
     geometry: Geometry,
@@ -119,22 +121,28 @@ def _expected(
 
     The path is a sum over parts in which the wheel that turns most travels `LEAST_PATH_M`, since
     the noise of poses would add up over steps. It is 0 below the `least` share of that travel, and
-    nan if the motion of the body is not known.
+    nan if the motion of the body is not known. The motion is that of the poses for wheels that are
+    commanded to turn, and for others that without a rotation of the pose sensor.
     """
-    known = np.isfinite(body).all(axis=1)
-    body, rim = body[known], rim[known]
+    known = np.isfinite(bodies[0]).all(axis=1)
+    bodies, rim = bodies[:, known], rim[known]
     travel = np.abs(rim).sum(axis=0)
     if travel.max(initial=0.0) < LEAST_PATH_M:
         return np.full(rim.shape[1], np.nan)
     turned = np.cumsum(np.abs(rim[:, np.argmax(travel)]))
     _, part = np.unique(turned // LEAST_PATH_M, return_inverse=True)
-    x, y, turn = (np.bincount(part, column) for column in body.T)
+    logged, straight = (
+        np.array([np.bincount(part, column) for column in body.T]) for body in bodies
+    )
+    turn = logged[2]
     slack = LEVER_BASES[geometry.determines_twist] * float(geometry.base_radius)
     squares = max(float(turn @ turn), 1e-300)
     out = np.zeros(rim.shape[1])
     for wheel, (ahead, left, lever) in enumerate(np.asarray(geometry.forward())):
+        confirmed = least[wheel] == CONFIRMED_SHARE
+        x, y, _ = logged if confirmed else straight
         along = ahead * x + left * y
-        if least[wheel] > CONFIRMED_SHARE:
+        if not confirmed:
             lever = np.clip(-(along @ turn) / squares, lever - slack, lever + slack)
         out[wheel] = np.abs(along + lever * turn).sum()
     return np.where(out > least * travel.max(), out, 0.0)

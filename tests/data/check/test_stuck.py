@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from slipid.api.calibration import calibrate
+from slipid.app.check import sanity
+from slipid.app.config import read_config
+from slipid.app.logs import packaged_config, unpack
+from slipid.app.problem import read_fit_task
+from slipid.data.check.findings import wrong
 from slipid.data.check.stuck import stuck_channels
 from slipid.model.robot import Robot
 from slipid.support.errors import DataError
+from slipid.support.progress import Reporter
 from tests.helpers.plain_robot import MECANUM, OMNI, as_runs, drive
 
 SPEED = 0.3
@@ -38,15 +44,22 @@ def kinds(raws, robot):
     return [finding.kind for finding in found]
 
 
-def test_a_wheel_on_whose_axle_the_robot_drives_stands_still():
-    assert kinds(straight(OMNI, 0.0, 0.2, "command", "twist"), OMNI) == []
+@pytest.mark.parametrize("rotated", [0.0, 0.6])
+def test_a_wheel_on_whose_axle_the_robot_drives_stands_still(rotated):
+    raws = straight(OMNI, 0.0, 0.2, "command", "twist")
+    raws = [replace(raw, pose=raw.pose + np.array([0.0, 0.0, rotated])) for raw in raws]
+    assert kinds(raws, OMNI) == []
 
 
 @pytest.mark.parametrize("less", ["command", "twist"])
 def test_a_wheel_that_is_commanded_to_stand_still_may_be_dragged(less):
-    """Slip as strong as this looks like a dead encoder without a command."""
-    assert kinds(straight(OMNI, 0.0, 0.8, less), OMNI) == []
-    assert kinds(straight(OMNI, 0.0, 0.8, "command", "twist"), OMNI) == ["wheel_constant"]
+    """Slip as strong as this, to either side, looks like a dead encoder without a command."""
+    known, unknown = (
+        [raw for drift in (0.8, -0.8) for raw in straight(OMNI, 0.0, drift, *names)]
+        for names in ((less,), ("command", "twist"))
+    )
+    assert kinds(known, OMNI) == []
+    assert kinds(unknown, OMNI) == ["wheel_constant"]
 
 
 def test_two_mecanum_wheels_may_stand_still_together():
@@ -69,3 +82,14 @@ def test_calibrate_refuses_a_dead_encoder():
     raws = [good, replace(bad, angle=bad.angle * [1.0, 0.0, 1.0])]
     with pytest.raises(DataError, match=r"wheel 2 never turns in 1 of 2 runs.*run_01.csv"):
         calibrate(as_runs(raws), Robot.of(OMNI.geometry), quiet=True)
+
+
+@pytest.mark.slow
+def test_runs_with_a_rotated_marker_have_no_exchanged_columns(tmp_path):
+    unpack(tmp_path)
+    config = tmp_path / "robot.toml"
+    config.write_text(packaged_config("robotino.toml"), encoding="utf-8")
+    task = read_fit_task(read_config(config), tmp_path / "fit" / "logs", Reporter(quiet=True))
+    assert wrong(sanity(task)) == ()
+    rotated = task.dataset.pose + np.array([0.0, 0.0, np.radians(20.0)])
+    assert wrong(sanity(replace(task, dataset=replace(task.dataset, pose=rotated)))) == ()
