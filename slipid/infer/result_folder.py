@@ -124,9 +124,9 @@ def refuse_foreign_config(folder: Path, text: str) -> None:
     path = folder / CONFIG
     if not path.is_file() or (found := text_of(path)) == text:
         return
-    if (folder / RUN).exists():
+    try:
         copied = _hash_of_config(folder) == sha256(found.encode()).hexdigest()
-    else:  # the writing of a fit was interrupted
+    except DataError:  # damaged, of an older version, or the writing of a fit was interrupted
         copied = any((folder / name).exists() for name in (FIT, IDENTIFIED))
     if not copied:
         raise DataError(

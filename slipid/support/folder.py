@@ -22,6 +22,7 @@ MARKS = {
     ".mcap": b"\0\0\0slipid ",
 }
 """Bytes by which a file of slipid is recognised, keyed by the ending of its usual name."""
+_PICTURE_OF_MATPLOTLIB = b"Software\0Matplotlib version"
 MARKED = 4096
 """Number of bytes at the beginning and at the end of a file that are searched for its mark."""
 
@@ -55,11 +56,18 @@ def refuse_foreign(path: Path, mark: bytes | None = None) -> None:
     with suppress(OSError), path.open("rb") as file:  # not readable: an error when it is written
         found = file.read(MARKED)
         file.seek(max(0, path.stat().st_size - MARKED))
-        if found and mark not in found and mark not in file.read():
+        if found and mark not in found and mark not in file.read() and not _is_older(path, found):
             raise DataError(
                 f"{path}: exists and was not written by slipid, and would be overwritten; expected "
                 "a new name or folder (or move the file away)"
             )
+
+
+def _is_older(path: Path, head: bytes) -> bool:
+    """Return True for a picture by matplotlib beside a JSON result: older versions marked none."""
+    return _PICTURE_OF_MATPLOTLIB in head and any(
+        MARKS[".json"] in beside.read_bytes()[:MARKED] for beside in path.parent.glob("*.json")
+    )
 
 
 @contextmanager

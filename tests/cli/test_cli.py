@@ -22,6 +22,7 @@ import typer
 from slipid.app.config import read_config, single_floor_sections
 from slipid.app.logs import matching_files, packaged_config, packaged_path
 from slipid.cli.main import app
+from slipid.infer.result_folder import refuse_foreign_config
 from slipid.report.html.results import read_results
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
@@ -382,6 +383,9 @@ def test_a_changed_config_is_not_that_of_the_fit(small, tmp_path):
     assert again.exit_code == 2
     assert "config.toml: no copy that slipid made for a fit, or changed since" in again.stderr
     assert config.read_text().endswith("# mine\n")
+    for damaged in ('{"schema": "slipid.run/0"}', "{"):  # `identify` mends it
+        (out / "run.json").write_text(damaged)
+        refuse_foreign_config(out, "of a different fit")
 
 
 @pytest.mark.slow

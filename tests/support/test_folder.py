@@ -148,3 +148,14 @@ def test_a_file_that_slipid_did_not_write_is_kept(tmp_path, suffix):
         pass
     assert path.read_bytes() == b"photo"
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_pictures_of_earlier_versions_are_replaced_beside_a_result(tmp_path):
+    old, new = b"Software\0Matplotlib version3.10", b"Software\0slipid"
+    picture = tmp_path / "paths.png"
+    picture.write_bytes(old)
+    with pytest.raises(DataError, match=r"paths\.png: exists and was not written by slipid"):
+        write_bytes(picture, new)
+    (tmp_path / "run.json").write_text('{"schema": "slipid.run/1"}')
+    write_bytes(picture, new)
+    assert picture.read_bytes() == new

@@ -125,18 +125,37 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
     if still and not still[0].runs:
         return still
     unmoved, useless = stuck_channels(data, geometry)
+    in_some_runs = [f for f in unmoved if f.kind == "wheel_constant" and f.runs]
+    # Runs with stuck encoders would spoil the comparison of the others. But if several wheels seem
+    # stuck, each in other runs, the config may have the wheels in wrong places instead.
+    subsets = [np.flatnonzero(~useless)] if useless.any() and not useless.all() else []
+    subsets += [np.arange(len(data))] if len(in_some_runs) > 1 else []
+    for subset in subsets if geometry.driven is None else ():
+        found = _of_subset(data.subset(subset), geometry, mass_kg)
+        if in_some_runs and _KINDS_OF_WHEELS & {finding.kind for finding in found}:
+            return worst_first([*still, *(f for f in unmoved if f not in in_some_runs), *found])
     still += unmoved
     if useless.all():
         return worst_first(still)
-    if useless.any():  # these runs would spoil the comparison of the others
+    if useless.any():
         data = data.subset(np.flatnonzero(~useless))
     if geometry.driven is not None:
         return worst_first([*still, *steered_findings(data, geometry)])
-    found = (*still, *_all(data, geometry, mass_kg))
+    return worst_first([*still, *_of_subset(data, geometry, mass_kg)])
+
+
+_KINDS_OF_WHEELS = {"wheel_order", "wheel_azimuths", "wheel_sign", "wheel_columns"}
+"""Kinds of findings about signs and places of the wheels, with which other wheels rightly stand
+still than with those of the config."""
+
+
+def _of_subset(data: Runs, geometry: Geometry, mass_kg: float | None) -> tuple[Finding, ...]:
+    """Return the findings from the comparison of all channels of runs."""
+    found = tuple(_all(data, geometry, mass_kg))
     if not {finding.kind for finding in found} & {*MADE_REDUNDANT_BY}:
         columns = tuple(misordered(data.logs))
         found = tuple(f for f in found if not columns or f.kind not in CAUSED_BY_ORDER) + columns
-    return worst_first(found)
+    return found
 
 
 def _no_motion(runs: Runs, radius: float) -> Iterator[Finding]:

@@ -235,7 +235,8 @@ def _wheel_constant(
         "wheel_constant",
         f"{_wheel(runs, wheel)} never turns in {which.sum()} of {len(which)} runs, while other "
         f"wheels turn and the robot moves its rim by up to {path:.2g} m",
-        "check its encoder and cable, or whether the wheel was blocked"
+        "check its encoder and cable, whether the wheel was blocked, and the places and the order "
+        "of the wheels in the config"
         + ("" if which.all() else "; exclude these runs from the globs of [[logs]]"),
         runs=() if which.all() else _names(runs, which),
     )

@@ -13,7 +13,9 @@ from slipid.app.config import read_config
 from slipid.app.logs import packaged_config, unpack
 from slipid.app.problem import read_fit_task
 from slipid.data.check.findings import wrong
+from slipid.data.check.sanity import findings
 from slipid.data.check.stuck import stuck_channels
+from slipid.model.geometry import omni
 from slipid.model.robot import Robot
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -85,7 +87,7 @@ def test_calibrate_refuses_a_dead_encoder():
 
 
 @pytest.mark.slow
-def test_runs_with_a_rotated_marker_have_no_exchanged_columns(tmp_path):
+def test_rotated_markers_and_wheels_are_not_stuck_encoders(tmp_path):
     unpack(tmp_path)
     config = tmp_path / "robot.toml"
     config.write_text(packaged_config("robotino.toml"), encoding="utf-8")
@@ -93,3 +95,8 @@ def test_runs_with_a_rotated_marker_have_no_exchanged_columns(tmp_path):
     assert wrong(sanity(task)) == ()
     rotated = task.dataset.pose + np.array([0.0, 0.0, np.radians(20.0)])
     assert wrong(sanity(replace(task, dataset=replace(task.dataset, pose=rotated)))) == ()
+    runs, lengths = task.dataset, (0.125, 0.04, 16.0)
+    for azimuths in ([0.0, 120.0, 240.0], [60.0, 300.0, 180.0]):
+        first, *others = wrong(findings(runs, omni(azimuths, *lengths)))
+        assert first.kind in ("wheel_azimuths", "wheel_order")
+        assert "wheel_constant" not in {finding.kind for finding in others}
