@@ -35,7 +35,7 @@ def refuse_odd(
                 raise DataError(f"{name} is empty; expected {expected}")
             odd = len(text) > 1 and any(ord(c) < 32 or 127 <= ord(c) < 160 for c in text)
             if odd and not _has_kind(command, param.name, Path):
-                raise DataError(f"{name} {shown(text)}; expected a value without line breaks")
+                raise DataError(f"{name} {shown(text)}; expected printable characters")
             if text.lower().lstrip("+-") == "nan" and _has_kind(command, param.name, float, int):
                 raise DataError(f"{name}: nan; expected a number")
 

@@ -169,7 +169,7 @@ def _check_json(options: Mapping[str, object]) -> None:
         schema = str(found.get("schema", "")) if isinstance(found, dict) else ""
         if not schema.startswith("slipid.") or schema.startswith(OVERWRITTEN_BY_NO_OPTION):
             raise DataError(
-                f"--json {name}: a file that is no JSON of an earlier result, and would be "
+                f"--json {name}: a file that `--json` did not write, and would be "
                 "overwritten; expected the name of a new file"
             )
 
@@ -185,7 +185,7 @@ def _refuse_own_input(options: Mapping[str, object]) -> None:
         for key in files.keys() - {written}:
             if files[key] == files[written] and not os.path.isdir(files[key]):
                 raise DataError(
-                    f"--{written} {shown(str(options[written]))}: also the file of the option "
+                    f"--{written} {shown(str(options[written]))}: also the file of "
                     f"{key.replace('_', '-')}, and would be overwritten; expected a different name"
                 )
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from slipid.app.identify import IdentifyResult
     from slipid.report.page import Page
 
+TRUTH = "fit/truth/truth.json"
+"""Name of the file of true values in the folder of logs."""
 PARTS = ("fit", "unseen")
 """Names of the folders of fitted runs and of predicted runs.
 
@@ -94,6 +96,11 @@ def run(
             "a different folder (or move the file away)"
         )
     source = out / plant
+    if plant == "recorded" and source.exists() and not (source / TRUTH).exists():
+        raise DataError(
+            f"{source}: not of the demo, since {TRUTH} is missing in it; expected a different "
+            "folder (or move it away)"
+        )
     if plant == "recorded":
         report.stage("unpacking recorded logs")
         unpack(source)
@@ -108,9 +115,7 @@ def run(
     with suppress(MissingExtra):  # `identify` has named it
         write_report(result)
     done = replace(done, written=(*done.written, *written))
-    truth = read_json(
-        source / "fit/truth/truth.json", "the true values that `slipid simulate` wrote"
-    )
+    truth = read_json(source / TRUTH, "the true values that `slipid simulate` wrote")
     return done, found, truth["parameters"]
 
 

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Json, Next, OutFolder, Quiet, can_draw, emit, for_robots, option
-from slipid.support.folder import locked
+from slipid.support.folder import locked, refuse_foreign
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.infer.design.proposal import Design
 
+COMMANDS = "design_commands.csv"
+"""Name of the file with the commands of the proposed runs."""
 SIMULATING_S = 40.0
 """Usual time in which candidate runs are simulated, on two cores [s]."""
 
@@ -78,6 +80,7 @@ def design(
 
     goals, places = (parameter or (), predict or ()), (floor or (), load or ())
     with Reporter(quiet=quiet) as report, locked(out, "design", "design.json", "design.png"):
+        refuse_foreign(out / COMMANDS, proposal.COLUMNS.encode())
         setup_jax(quiet=True)
         fit = load_fit(out)
         report.stage("simulating candidate runs", usual_s=SIMULATING_S)
@@ -99,8 +102,8 @@ def write(found: "Design", out: Path, report: Reporter) -> list[str]:
     from slipid.infer.design.proposal import commands
     from slipid.support.files import write_bytes, write_json
 
+    table, picture = out / COMMANDS, out / "design.png"
     write_json(out / "design.json", found.content)
-    table, picture = out / "design_commands.csv", out / "design.png"
     if not found.runs:
         for old in (table, picture):
             old.unlink(missing_ok=True)

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from inspect import cleandoc
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn, TextIO
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -305,32 +305,50 @@ def main() -> None:
     sys.unraisablehook = _interrupt_again
     # where its folders cannot be written, matplotlib works all the same
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # it was closed
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
         app()
-    except (OSError, SystemExit) as end:
-        lost = _lost_output(probe=isinstance(end, OSError))
-        if lost is None:
+        sys.stdout.flush()
+    except SystemExit as end:
+        if (lost := _lost(sys.stdout)) is not None:
+            _report(lost)
+        # Python would repeat an error of stderr at its end, and exit with a code of its own
+        _lost(sys.stderr)
+        raise end
+    except OSError as error:
+        # without a buffer, or while a message is printed, the error comes from the stream itself
+        if error.filename is not None or error.errno not in _OF_STREAMS:
             raise
-        if lost.errno == errno.EPIPE:  # a reader such as `head` has enough
-            sys.exit(1)
-        typer.echo(f"standard output cannot be written ({lost.strerror})", err=True)
-        sys.exit(2)
+        _report(_lost(sys.stdout) or error)
 
 
-def _lost_output(probe: bool) -> OSError | None:
-    """Return the error with which standard output cannot be written, None if it can be.
+_OF_STREAMS = (errno.ENOSPC, errno.EPIPE, errno.EBADF, errno.EIO)
+"""Errors of a stream that was closed or that is redirected to a full disk."""
+
+
+def _report(lost: OSError) -> NoReturn:
+    """Exit because standard output cannot be written; silently if its reader has enough.
+
+    If standard error cannot be written either, there is no message.
+    """
+    if lost.errno == errno.EPIPE:  # a reader such as `head`
+        sys.exit(1)
+    _lost(sys.stderr, f"standard output cannot be written ({lost.strerror})\n")
+    sys.exit(2)
+
+
+def _lost(stream: TextIO, text: str = "") -> OSError | None:
+    """Write a text and all that waits for it; return the error if the stream cannot be written.
 
     After an error, nothing more is written to it, since Python would repeat the error at its end.
-    With `probe`, a line end is written, as an output without a buffer has nothing left to write.
     """
-    if sys.stdout is None:
-        return None
     try:
-        sys.stdout.flush()
-        if probe:
-            os.write(sys.stdout.fileno(), b"\n")
+        stream.write(text)
+        stream.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         return error
     return None
 

@@ -57,10 +57,10 @@ def sample(
     from slipid.support.files import read_json
 
     require_packages()
-    from slipid.app.sample import WRITTEN
+    from slipid.app.sample import OF_SAMPLE, WRITTEN
     from slipid.app.sample import sample as run
 
-    with Reporter(quiet=quiet) as report, locked(out, "sample", "sample.json"):
+    with Reporter(quiet=quiet) as report, locked(out, "sample", *OF_SAMPLE):
         posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
         written = [*WRITTEN]
         if can_draw(report):

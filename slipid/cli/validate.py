@@ -23,6 +23,8 @@ from slipid.support.progress import Reporter
 
 VALIDATION = "validation.json"
 """Name of the file in the result folder, which the page of the results shows."""
+NAMES = (VALIDATION, "validation_errors.png", "validation_paths.png")
+"""Names of all files that the command writes."""
 
 
 @for_robots
@@ -46,7 +48,7 @@ def validate(
     """
     from slipid.report.answers import show_validation
 
-    with Reporter(quiet=quiet) as report, locked(out, "validate", "validation.json"):
+    with Reporter(quiet=quiet) as report, locked(out, "validate", *NAMES):
         found, written = run(out, data, report, logs)
     emit(json, found, lambda page: show_validation(page, found), [renew(out)], out, written)
     return 0

@@ -11,6 +11,7 @@ from slipid.model.feedforward import Feedforward, Gain
 from slipid.robot.feedback import UNITS, FeedbackGains
 from slipid.support.content import Content
 from slipid.support.files import write_bytes
+from slipid.support.folder import refuse_foreign
 
 HEADER, PARAMETERS = "motor_feedforward.h", "motor_feedforward.yaml"
 """Names of the files with gains in C and for ROS 2."""
@@ -56,6 +57,8 @@ def write_gains(folder: Path, found: Sequence[Feedforward]) -> tuple[str, ...]:
         return ()
     lines = [*comment(_head()), *nodes([("slipid", tuple(gain_parameters(found)))])]
     yaml = "\n".join(lines) + "\n"
+    for name in (HEADER, PARAMETERS):
+        refuse_foreign(folder / name, b"slipid")
     write_bytes(folder / HEADER, c_header(found).encode())
     write_bytes(folder / PARAMETERS, yaml.encode())
     return HEADER, PARAMETERS

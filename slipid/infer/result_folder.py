@@ -105,7 +105,7 @@ def config_text(folder: Path) -> str:
     """
     path = folder / CONFIG
     text = text_of(path)
-    if sha256(text.encode()).hexdigest() != _hash_of_config(folder):
+    if not _is_text(text, _hash_of_config(folder)):
         raise DataError(
             f"{path}: not the config of the fit, whose SHA-256 is in {RUN}; expected this file "
             "unchanged, since results depend on it. To use a changed config, copy it and run "
@@ -125,7 +125,7 @@ def refuse_foreign_config(folder: Path, text: str) -> None:
     if not path.is_file() or (found := text_of(path)) == text:
         return
     try:
-        copied = _hash_of_config(folder) == sha256(found.encode()).hexdigest()
+        copied = _is_text(found, _hash_of_config(folder))
     except DataError:  # damaged, of an older version, or the writing of a fit was interrupted
         copied = any((folder / name).exists() for name in (FIT, IDENTIFIED))
     if not copied:
@@ -133,6 +133,16 @@ def refuse_foreign_config(folder: Path, text: str) -> None:
             f"{path}: no copy that slipid made for a fit, or changed since, and would be "
             "overwritten; expected a different folder (or move the file away)"
         )
+
+
+def _is_text(text: str, mark: str) -> bool:
+    """Return whether a text has this SHA-256, with the line ends of any system.
+
+    Version control and editors change them without being asked.
+    """
+    plain = text.replace("\r\n", "\n")
+    forms = (text, plain, plain.replace("\n", "\r\n"))
+    return mark in {sha256(form.encode()).hexdigest() for form in forms}
 
 
 def _hash_of_config(folder: Path) -> str:

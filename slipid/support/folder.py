@@ -19,6 +19,7 @@ MARKS = {
     ".json": b'"slipid.',
     ".html": b'<meta name="generator" content="slipid">',
     ".png": b"Software\0slipid",
+    ".nc": b"slipid.",
     ".mcap": b"\0\0\0slipid ",
 }
 """Bytes by which a file of slipid is recognised, keyed by the ending of its usual name."""

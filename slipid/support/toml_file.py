@@ -30,7 +30,7 @@ class Section(BaseModel):
 def text_of(path: Path, what: str = "a config") -> str:
     """Return the text of a file; raise `DataError`, naming the expected `what`, if unreadable."""
     try:
-        return read_bytes(path, f"{what} (TOML file)", _MOST_BYTES).decode("utf-8")
+        return read_bytes(path, f"{what} (TOML file)", _MOST_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not UTF-8 text; expected {what} (TOML file)") from error
 

@@ -331,10 +331,10 @@ def test_json_overwrites_no_file_that_is_not_the_json_of_a_result(tmp_path, cont
     path.write_text(content)
     result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", path)
     assert result.exit_code == 2
-    assert "mine: a file that is no JSON of an earlier result, and would be" in result.stderr
+    assert "mine: a file that `--json` did not write, and would be" in result.stderr
     assert path.read_text() == content
     result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", tmp_path / "a.toml")
-    assert "a.toml': also the file of the option config" in result.stderr
+    assert "a.toml': also the file of config" in result.stderr
     path.write_text('{"schema": "slipid.check/1"}')
     result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", path)
     assert "a.toml" in result.stderr
@@ -374,7 +374,15 @@ def test_a_changed_config_is_not_that_of_the_fit(small, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(folder / "out", out)
     config = out / "config.toml"
-    config.write_text(config.read_text() + "# mine\n")
+    text = config.read_text()
+    config.write_bytes(("\ufeff" + text.replace("\n", "\r\n")).encode())
+    assert invoke("report", out).exit_code == 0  # line ends of Windows
+    (out / "posterior.nc").write_text("mine")
+    result = invoke("sample", out)
+    assert result.exit_code == 2
+    assert "posterior.nc: exists and was not written by slipid" in result.stderr
+    (out / "posterior.nc").unlink()
+    config.write_text(text + "# mine\n")
     for words in (("report",), ("sample",), ("validate", "--data", folder / "unseen")):
         result = invoke(*words, out)
         assert result.exit_code == 2

@@ -65,7 +65,7 @@ def test_a_number_beyond_its_limits_is_refused(tmp_path, text, capsys):
         (("trial", "fit", "--speed", "-NaN"), "--speed: nan; expected a number\n"),
         (
             ("trial", "fit", "--controllers", "a\nb"),
-            "--controllers 'a\\nb'; expected a value without line breaks\n",
+            "--controllers 'a\\nb'; expected printable characters\n",
         ),
     ],
 )

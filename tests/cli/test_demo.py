@@ -45,6 +45,11 @@ def test_an_edited_config_is_kept(tmp_path):
     assert result.exit_code == 2
     assert "robotino.toml: differs from the config of the demo" in result.stderr
     assert (config.read_text(), len(list(tmp_path.iterdir()))) == ("mine", 1)
+    config.unlink()
+    (tmp_path / "recorded").mkdir()
+    result = invoke("demo", "--out", tmp_path)
+    assert result.exit_code == 2
+    assert "recorded: not of the demo" in result.stderr
 
 
 def test_packing_what_was_unpacked_gives_the_same_bytes(tmp_path):

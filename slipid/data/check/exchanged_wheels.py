@@ -74,8 +74,8 @@ def exchanged_wheels(
         f"columns exchanged: in the clearest run {after[worst]:.2f} of the motion remains "
         f"unexplained with wheels {a + 1} and {b + 1} exchanged, and {before[worst]:.2f} as "
         "declared",
-        "exchange the columns of these runs in a layout of their own, or exclude the runs from the "
-        "globs of [[logs]]",
+        "exchange the columns of these runs (or x and y of their poses, if those are exchanged "
+        "instead) in a layout of their own, or exclude the runs from the globs of [[logs]]",
         runs=tuple(names[k] for k in np.flatnonzero(which)),
     )
     return found, which

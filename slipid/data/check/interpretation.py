@@ -33,6 +33,9 @@ from slipid.model.geometry import Geometry
 
 LEAST_MOTION = 1e-3
 """Share of the predicted motion below which an axis is not compared [1]."""
+POSSIBLE_SHARE = 0.99
+"""Least share of the steps whose headings are possible under a convention, as those above 1 are not
+for a sine; with a smaller share the convention is not compared [1]."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ class Evidence:
             base radius.
         base: base radius [m].
         pose: products of the turns as declared with the body increments from the poses, for each
-            convention without offset.
+            convention without offset under which the logged headings are possible.
         twist: products of the turns as declared with the commanded body increments, or None.
         command: products of the turns as declared with the commanded turns, or None.
         gyro: correlation of gyro and heading for each convention without offset; None if no run
@@ -128,10 +131,11 @@ def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evide
     rolling = np.asarray(geometry.forward()) / float(geometry.wheel_radius) / [1.0, 1.0, base]
     pose: dict[PoseConvention, Products] = {}
     gyro: dict[PoseConvention, float] = {}
+    known = usable(moved.wheels, body_motion(at, PoseConvention())).sum()
     for convention in CONVENTIONS:
         body = body_motion(at, convention)
         found = products(moved.wheels, body, base)
-        if found is None:
+        if found is None or found.known.sum() < POSSIBLE_SHARE * known:
             continue
         pose[convention] = found
         if moved.gyro is not None:

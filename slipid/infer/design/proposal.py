@@ -277,9 +277,13 @@ def _against(
     }
 
 
+COLUMNS = "run,floor,load,vx_m_s,vy_m_s,turn_rad_s,seconds"
+"""Names of the columns of a table of commands."""
+
+
 def commands(found: Design) -> str:
     """Return the commands as CSV: body twist and duration of every run."""
-    lines = ["run,floor,load,vx_m_s,vy_m_s,turn_rad_s,seconds"]
+    lines = [COLUMNS]
     for k, d in enumerate(found.runs, 1):
         vx, vy, turn = d.command + 0.0
         seconds = d.seconds(found.base_radius)
