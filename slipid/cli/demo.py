@@ -11,7 +11,7 @@ from slipid.cli.common import MOST_SEED, Next, Out, Quiet, emit, executor_of, gu
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.extras import MissingExtra
-from slipid.support.folder import locked
+from slipid.support.folder import locked, name_of_temporary
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -96,7 +96,9 @@ def run(
             "a different folder (or move the file away)"
         )
     source = out / plant
-    if plant == "recorded" and source.exists() and not (source / TRUTH).exists():
+    files = (path for path in source.rglob("*") if path.is_file())
+    theirs = any(name_of_temporary(path.name) is None for path in files)
+    if plant == "recorded" and theirs and not (source / TRUTH).exists():
         raise DataError(
             f"{source}: not of the demo, since {TRUTH} is missing in it; expected a different "
             "folder (or move it away)"

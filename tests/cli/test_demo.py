@@ -47,6 +47,7 @@ def test_an_edited_config_is_kept(tmp_path):
     assert (config.read_text(), len(list(tmp_path.iterdir()))) == ("mine", 1)
     config.unlink()
     (tmp_path / "recorded").mkdir()
+    (tmp_path / "recorded" / "mine.csv").touch()
     result = invoke("demo", "--out", tmp_path)
     assert result.exit_code == 2
     assert "recorded: not of the demo" in result.stderr
