@@ -24,6 +24,7 @@ from slipid.app.problem import (
     lag_from_motion,
     read_fit_task,
     with_mixed,
+    without_short_runs,
 )
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.check.findings import by_reason
@@ -338,6 +339,8 @@ def _judged(out: Path, data: Path, report: Reporter, glob: str | None) -> tuple[
     sections = single_floor_sections([*others, *logs] if glob is not None else others or logs)
     report.stage("reading logs")
     dataset, skipped = read_dataset(config, sections, data, report, glob)
+    dataset, short = without_short_runs(config, dataset)
+    skipped += short
     refuse_misordered(dataset.logs)
     for sentence in by_reason(skipped):
         report.line(sentence)

@@ -1,6 +1,6 @@
 """Reading of the logs that a config names, as one set of runs; also access to packaged files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,6 +31,7 @@ from slipid.support.checkpoint import versions
 from slipid.support.content import Content
 from slipid.support.errors import DataError, bad_data, did_you_mean, refused_as
 from slipid.support.files import read_json, write_bytes, write_json
+from slipid.support.folder import name_of_temporary
 from slipid.support.progress import Reporter
 
 
@@ -307,7 +308,12 @@ def packaged_config(name: str) -> str:
 
 
 def unpack(out: Path) -> None:
-    """Write the recorded logs of the test site, and their true values, to a folder."""
+    """Write the recorded logs of the test site, and their true values, to a folder.
+
+    Raises:
+        DataError: the archive is damaged, or the folder has other logs or changed files, which are
+            kept.
+    """
     expected = "the recorded logs; install slipid again"
     with refused_as(RECORDED, expected), ZipFile(RECORDED) as archive:
         members = archive.infolist()
@@ -317,5 +323,37 @@ def unpack(out: Path) -> None:
     for name in content:
         if ".." in Path(name).parts or not (out / name).is_relative_to(out):
             raise bad_data(RECORDED, f"the path '{name}'", expected)
-    for name in sorted(content, key=lambda name: "/truth/" not in name):  # a mark of the folder
-        write_bytes(out / name, content[name])
+    _refuse_other_logs(out, content)
+    for name, data in content.items():
+        write_bytes(out / name, data)
+
+
+def _refuse_other_logs(folder: Path, content: Mapping[str, bytes]) -> None:
+    """Raise `DataError` if a folder has logs that are not among files, or changed files.
+
+    `content` has the files, keyed by their path in the folder. Other line ends are no change.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise DataError(f"{folder}: a file; expected a folder of logs (move it away)")
+    theirs = [
+        path
+        for path in sorted(folder.rglob("*"))
+        if path.suffix == ".csv"
+        and name_of_temporary(path.name) is None
+        and path.relative_to(folder).as_posix() not in content
+    ]
+    theirs += [
+        path
+        for path, data in ((folder / name, data) for name, data in content.items())
+        if path.is_file() and _plain(path.read_bytes()) not in (b"", _plain(data))
+    ]
+    if theirs:
+        raise DataError(
+            f"{theirs[0]}: no recorded log of this version of slipid, or changed since; expected a "
+            "different folder (or move it away)"
+        )
+
+
+def _plain(data: bytes) -> bytes:
+    """Return the content of a file with the line ends of Unix, empty if it has only zeros."""
+    return data.strip(b"\0").replace(b"\r\n", b"\n")

@@ -32,6 +32,7 @@ from slipid.data.align.lag import pose_lag
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.check.findings import by_reason
 from slipid.data.check.own_settings import own_settings
+from slipid.data.check.short_runs import short_runs
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
@@ -293,7 +294,20 @@ def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask
     dataset, skipped = read_dataset(
         config, single_floor_sections(config.content.logs), root, report
     )
+    dataset, short = without_short_runs(config, dataset)
+    skipped += short
     return fit_task(config, dataset, skipped, report)
+
+
+def without_short_runs(config: Config, data: Runs) -> tuple[Runs, list[str]]:
+    """Return the runs without those in which the robot hardly moves, and a line about each such."""
+    fewest = config.content.fit.windows_per_piece + 1
+    short = short_runs(data, config.content.wheels.wheel_radius_m, fewest)
+    if not short:
+        return data, []
+    lines = [f"set aside: {sentence}" for sentence in short.values()]
+    kept = data.subset([run for run in range(len(data)) if run not in short])
+    return replace(kept, aside=(*data.aside, *lines)), lines
 
 
 def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTask:

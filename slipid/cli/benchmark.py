@@ -90,7 +90,7 @@ def paper(
     require("matplotlib", "report", "`slipid paper`")
     from slipid.lab.paper2021.plots import run
 
-    with locked(out, "paper", "paper.json"):
+    with locked(out, "paper", "paper.json", "figure?_*.png"):
         for path in run(data, out):
             typer.echo(str(path))
     suggest([Next("compare it with other systems", ("benchmark", "--data", data))])

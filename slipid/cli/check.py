@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from slipid.app.config import Config
 
 
+NAMES = ("check.json", "report.html", "raw_*.png", "bench.png", "bench_*.png")
+"""Names of all files that the command writes."""
+
+
 @guarded
 def check(
     config: ConfigFile,
@@ -41,7 +45,7 @@ def check(
     if isinstance(wanted.content.robot, BenchMotors):
         return bench(wanted, data, out, json, quiet)
     written: tuple[str, ...] = ()
-    with Reporter(quiet=quiet) as report, locked(out, "check", "check.json", "report.html"):
+    with Reporter(quiet=quiet) as report, locked(out, "check", *NAMES):
         logs, found = checks.check(config, data, out, report)
         if out is not None:
             from slipid.report.html.check_page import check_page
@@ -71,7 +75,7 @@ def bench(config: "Config", data: Path, out: Path | None, json: str | None, quie
     from slipid.report.checks import show_bench_check
 
     written: tuple[str, ...] = ()
-    with Reporter(quiet=quiet) as report, locked(out, "check", "check.json", "report.html"):
+    with Reporter(quiet=quiet) as report, locked(out, "check", *NAMES):
         fit, found = check_bench(config, data, out, report)
         if out is not None:
             from slipid.report.html.bench_page import bench_page

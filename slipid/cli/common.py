@@ -68,8 +68,20 @@ Jobs = Annotated[
     int | None,
     typer.Option(min=1, max=1024, help="Number of parallel processes; by default one per core."),
 ]
-OVERWRITTEN_BY_NO_OPTION = ("slipid.fit/", "slipid.robot/", "slipid.run/")
-"""Beginnings of the schemas of files without which a result is lost."""
+SCHEMAS = {
+    "calibrate": ("camera",),
+    "compare": ("comparison",),
+    "export": ("export", "export_check"),
+    "identify": ("identified",),
+    "map_": ("map_result",),
+    "motor": ("identified",),
+    "robots": ("reference", "references"),
+    "sample": ("identified",),
+    "simulate": ("simulation",),
+    "validate": ("validation",),
+}
+"""Names of the schemas of the JSON that commands write, keyed by the name of the function; the
+schemas of others have its own name."""
 OUTPUTS = frozenset(("json", "out", "preview"))
 """Options whose values are written to."""
 LONGEST_NAME = 255
@@ -122,7 +134,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     @functools.wraps(command)
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
-            _check_json(options)
+            _check_json(SCHEMAS.get(command.__name__, (command.__name__,)), options)
             _refuse_own_input(options)
             _check_names(options)
             _refuse_nan(options)
@@ -141,37 +153,60 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     return run
 
 
-def _check_json(options: Mapping[str, object]) -> None:
+def _check_json(schemas: Sequence[str], options: Mapping[str, object]) -> None:
     """Raise `DataError` unless the option `json` is `-`, None or the name of a file to write.
 
-    This is checked first, as the file is written after the work. A file that is there must be a
-    JSON result of slipid, but no part of a fit.
+    This is checked first, as the file is written after the work. A file that is there must be JSON
+    of the same command, and may only be in a result folder if this is `out`.
+
+    Args:
+        schemas: names of the schemas of the command's JSON.
+        options: values of all options by name.
     """
     name = options.get("json")
     if not isinstance(name, str) or name == "-":
         return
-    from slipid.support.files import read_json, target_of
+    from slipid.support.files import target_of
 
-    if not name or any(c in "*?" or not c.isprintable() for c in name):
+    odd = any(c in "*?" or not c.isprintable() for c in name)
+    if not name or odd or name.startswith(("-", "~")):
         raise DataError(
             f"--json {name[:80]!r}: no name of a file; expected a path without * and ?, or - for "
-            "standard output"
+            "standard output (./ before a name that begins with - or ~)"
         )
     try:
         target = target_of(Path(name))
     except DataError as error:
         raise DataError(f"--json {error}, or - for standard output") from error
-    if target.exists() and target.stat().st_size:
-        try:
-            found = read_json(target, "JSON")
-        except DataError:
-            found = None
-        schema = str(found.get("schema", "")) if isinstance(found, dict) else ""
-        if not schema.startswith("slipid.") or schema.startswith(OVERWRITTEN_BY_NO_OPTION):
+    _refuse_other_json(target, schemas)
+    out = options.get("out")
+    if target.exists() and not (isinstance(out, Path) and target.parent.samefile(out)):
+        from slipid.infer.result_folder import FIT, IDENTIFIED, WRITTEN
+
+        beside = (target.parent / one for one in (FIT, IDENTIFIED))
+        if target.name in WRITTEN and any(map(Path.exists, beside)):
             raise DataError(
-                f"--json {name}: a file that `--json` did not write, and would be "
+                f"--json {name}: belongs to the results in {target.parent}, and would be "
                 "overwritten; expected the name of a new file"
             )
+
+
+def _refuse_other_json(path: Path, schemas: Sequence[str]) -> None:
+    """Raise `DataError` if a file exists that is not empty and has none of some schemas."""
+    from slipid.support.files import read_json
+
+    if not path.exists() or not path.stat().st_size:
+        return
+    try:
+        found = read_json(path, "JSON")
+    except DataError:
+        found = None
+    schema = str(found.get("schema", "")) if isinstance(found, dict) else ""
+    if schema.removeprefix("slipid.").split("/")[0] not in schemas:
+        raise DataError(
+            f"--json {path}: a file that `--json` of this command did not write, and would be "
+            "overwritten; expected the name of a new file"
+        )
 
 
 def _refuse_own_input(options: Mapping[str, object]) -> None:
@@ -191,10 +226,14 @@ def _refuse_own_input(options: Mapping[str, object]) -> None:
 
 
 def _check_names(options: Mapping[str, object]) -> None:
-    """Raise `DataError` for a path with too long a name, and for control characters in `out`."""
+    """Raise `DataError` for a path with too long a name or ~, and control characters in `out`."""
     if not (out := str(options.get("out", ""))).isprintable():
         raise DataError(f"{shown(out)}: a name to write to; expected printable characters")
     for path in (value for value in options.values() if isinstance(value, Path)):
+        if path.parts[:1] == ("~",):
+            raise DataError(
+                f"{shown(str(path))}: the shell did not replace the ~; expected a whole path"
+            )
         if max(map(len, map(os.fsencode, path.parts)), default=0) > LONGEST_NAME:
             raise DataError(
                 f"{shown(str(path))}: a name of over {LONGEST_NAME} bytes; expected a shorter one"

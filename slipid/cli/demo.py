@@ -11,7 +11,7 @@ from slipid.cli.common import MOST_SEED, Next, Out, Quiet, emit, executor_of, gu
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.extras import MissingExtra
-from slipid.support.folder import locked, name_of_temporary
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -42,9 +42,11 @@ def demo(
     quiet: Quiet = False,
 ) -> int:
     """Identify a robot from small logs of the virtual test site; write all results to a folder."""
+    from slipid.infer.result_folder import WRITTEN
+
     with (
         Reporter(quiet=quiet) as report,
-        locked(out / "result", "demo"),
+        locked(out / "result", "demo", *WRITTEN),
         executor_of(None) as executor,
     ):
         done, found, truth = run(out, plant, seed, executor, report)
@@ -82,6 +84,7 @@ def run(
     from slipid.app.logs import packaged_config, unpack
     from slipid.cli.identify import run as identify
     from slipid.cli.validate import run as validate
+    from slipid.infer.result_folder import CONFIG, refuse_foreign_config
     from slipid.report.html.fit_page import write_report
     from slipid.support.files import read_json, write_bytes
 
@@ -89,27 +92,16 @@ def run(
         raise DataError(f"--plant {plant}: unknown; expected recorded or mujoco")
     if plant == "recorded" and seed is not None:
         raise DataError("--seed is given without a simulation; expected --plant mujoco with it")
-    config, text = out / "robotino.toml", packaged_config("robotino.toml").encode()
-    if config.is_file() and config.read_bytes() != text:
-        raise DataError(
-            f"{config}: differs from the config of the demo, and would be overwritten; expected "
-            "a different folder (or move the file away)"
-        )
-    source = out / plant
-    files = (path for path in source.rglob("*") if path.is_file())
-    theirs = any(name_of_temporary(path.name) is None for path in files)
-    if plant == "recorded" and theirs and not (source / TRUTH).exists():
-        raise DataError(
-            f"{source}: not of the demo, since {TRUTH} is missing in it; expected a different "
-            "folder (or move it away)"
-        )
+    config, text = out / "robotino.toml", packaged_config("robotino.toml")
+    result, source = out / "result", out / plant
+    for path in (config, result / CONFIG):
+        refuse_foreign_config(result, text, path)
     if plant == "recorded":
         report.stage("unpacking recorded logs")
         unpack(source)
     else:
         drive_anew(source, seed or 0, executor, report)
-    write_bytes(config, text)
-    result = out / "result"
+    write_bytes(config, text.encode())
     logs = source / "fit" / "logs"
     done = identify(checked_task(out / "robotino.toml", logs, report), logs, result, report)
     found, written = validate(result, source / "unseen" / "logs", report)

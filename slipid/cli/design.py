@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Json, Next, OutFolder, Quiet, can_draw, emit, for_robots, option
-from slipid.support.folder import locked, refuse_foreign
+from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 COMMANDS = "design_commands.csv"
 """Name of the file with the commands of the proposed runs."""
+NAMES = ("design.json", "design.png", COMMANDS)
+"""Names of all files that the command writes."""
 SIMULATING_S = 40.0
 """Usual time in which candidate runs are simulated, on two cores [s]."""
 
@@ -79,8 +81,7 @@ def design(
     from slipid.support.jax_setup import setup_jax
 
     goals, places = (parameter or (), predict or ()), (floor or (), load or ())
-    with Reporter(quiet=quiet) as report, locked(out, "design", "design.json", "design.png"):
-        refuse_foreign(out / COMMANDS, proposal.COLUMNS.encode())
+    with Reporter(quiet=quiet) as report, locked(out, "design", *NAMES):
         setup_jax(quiet=True)
         fit = load_fit(out)
         report.stage("simulating candidate runs", usual_s=SIMULATING_S)

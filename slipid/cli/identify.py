@@ -182,7 +182,7 @@ def bench(
 
     if profile:
         raise DataError("--profile is not available for drive = 'motor'; omit it")
-    with Reporter(quiet=quiet) as report, locked(out, "identify", *WRITTEN):
+    with Reporter(quiet=quiet) as report, locked(out, "identify", *WRITTEN, "bench_*.png"):
         refuse_foreign_config(out, config.text)
         fit, written = identify_bench(config, data, out, report)
         if can_draw(report):

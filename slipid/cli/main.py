@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from inspect import cleandoc
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TextIO, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -305,52 +305,52 @@ def main() -> None:
     sys.unraisablehook = _interrupt_again
     # where its folders cannot be written, matplotlib works all the same
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # it was closed
-            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+    out, errors = Stream(sys.stdout), Stream(sys.stderr)
+    sys.stdout, sys.stderr = cast("tuple[TextIO, TextIO]", (out, errors))
     try:
         app()
-        sys.stdout.flush()
-    except SystemExit as end:
-        if (lost := _lost(sys.stdout)) is not None:
-            _report(lost)
-        # Python would repeat an error of stderr at its end, and exit with a code of its own
-        _lost(sys.stderr)
-        raise end
-    except OSError as error:
-        # without a buffer, or while a message is printed, the error comes from the stream itself
-        if error.filename is not None or error.errno not in _OF_STREAMS:
-            raise
-        _report(_lost(sys.stdout) or error)
+    finally:
+        out.flush()
+        if out.lost is not None and out.lost.errno != errno.EPIPE:
+            errors.write(f"standard output cannot be written ({out.lost.strerror})\n")
+        errors.flush()
+        if out.lost is not None:  # a reader such as `head` ends without an error
+            sys.exit(1 if out.lost.errno == errno.EPIPE else 2)
 
 
-_OF_STREAMS = (errno.ENOSPC, errno.EPIPE, errno.EBADF, errno.EIO)
-"""Errors of a stream that was closed or that is redirected to a full disk."""
+class Stream:
+    """A standard stream whose errors do not stop the work, since its files matter more.
 
+    After an error nothing is written to it any more.
 
-def _report(lost: OSError) -> NoReturn:
-    """Exit because standard output cannot be written; silently if its reader has enough.
-
-    If standard error cannot be written either, there is no message.
+    Attributes:
+        lost: the first error, such as that of a full disk or of a reader that has ended; or None.
     """
-    if lost.errno == errno.EPIPE:  # a reader such as `head`
-        sys.exit(1)
-    _lost(sys.stderr, f"standard output cannot be written ({lost.strerror})\n")
-    sys.exit(2)
 
+    def __init__(self, stream: TextIO | None):
+        self.lost: OSError | None = None
+        # it is None if it was closed
+        self._stream = stream or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
 
-def _lost(stream: TextIO, text: str = "") -> OSError | None:
-    """Write a text and all that waits for it; return the error if the stream cannot be written.
+    def write(self, text: str) -> int:
+        """Write a text, and return its length."""
+        return self._tried(lambda: self._stream.write(text)) or len(text)
 
-    After an error, nothing more is written to it, since Python would repeat the error at its end.
-    """
-    try:
-        stream.write(text)
-        stream.flush()
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-        return error
-    return None
+    def flush(self) -> None:
+        """Write all that waits for it."""
+        self._tried(self._stream.flush)
+
+    def _tried(self, action: Callable[[], int | None]) -> int | None:
+        """Return the result of an action; after an error, redirect the stream to nothing."""
+        try:
+            return action()
+        except OSError as error:
+            self.lost = self.lost or error
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+            return None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:

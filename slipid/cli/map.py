@@ -64,7 +64,7 @@ def map_(
     one_blas_thread()  # several threads would slow down the many small matrix products
     robot = RobotShape(dictionary, robot_radius, marker_height)
     options = MapOptions(config, surfaces, robot, cell)
-    with Reporter(quiet=quiet) as report, locked(out, "map"):
+    with Reporter(quiet=quiet) as report, locked(out, "map", "map.geojson", "map.png"):
         result = map_of(image, OverheadCamera.load(camera), options, report)
         if result.proposal is not None and (out / PROPOSAL).exists():
             raise DataError(

@@ -12,6 +12,8 @@ from slipid.support.folder import locked
 from slipid.support.progress import Reporter
 from slipid.support.quantities import GearRatio, PolePairs, TicksPerTurn
 
+NAMES = ("motor.json", "report.html", "bench.png", "bench_*.png", "motor_feedforward.*")
+"""Names of all files that the command writes."""
 Column = str | None
 _column = partial(option, "[FILE::]NAME[:UNIT]")
 
@@ -111,7 +113,7 @@ def motor(
         ignored=frozenset(ignore or ()),
     )
     given = {c: given_columns(text, c) for c, text in columns.items() if text is not None}
-    with Reporter(quiet=quiet) as report, locked(out, "motor", "motor.json", "report.html"):
+    with Reporter(quiet=quiet) as report, locked(out, "motor", *NAMES):
         report.stage("reading the log")
         task = read_motor_log(file, given, delimiter, options, between)
         fit = task.fit(report)

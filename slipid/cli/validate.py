@@ -99,7 +99,7 @@ def compare(
     from slipid.app.compare import compare as run
     from slipid.report.answers import show_comparison
 
-    with Reporter(quiet=quiet) as report, locked(out, "compare", "comparison.json"):
+    with Reporter(quiet=quiet) as report, locked(out, "compare", "comparison.*"):
         found = run(config, data, out, folds.replace(" ", "").split(","), report)
         written = ["comparison.json"]
         if can_draw(report):

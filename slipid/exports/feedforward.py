@@ -58,7 +58,7 @@ def write_gains(folder: Path, found: Sequence[Feedforward]) -> tuple[str, ...]:
     lines = [*comment(_head()), *nodes([("slipid", tuple(gain_parameters(found)))])]
     yaml = "\n".join(lines) + "\n"
     for name in (HEADER, PARAMETERS):
-        refuse_foreign(folder / name, b"slipid")
+        refuse_foreign(folder / name)
     write_bytes(folder / HEADER, c_header(found).encode())
     write_bytes(folder / PARAMETERS, yaml.encode())
     return HEADER, PARAMETERS

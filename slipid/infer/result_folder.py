@@ -63,8 +63,8 @@ def fit_of(folder: Path) -> str | None:
     has none, and is not compared.
 
     Raises:
-        DataError: files in the folder are of different fits, or the writing of a fit was
-            interrupted; the message says what to do.
+        DataError: files in the folder are of different fits, the copy of the config was changed, or
+            the writing of a fit was interrupted; the message says what to do.
     """
     marks = {FIT: _under(folder / FIT, "checksum")}
     marks |= {name: _under(folder / name, "fit") for name in (IDENTIFIED, RUN)}
@@ -82,6 +82,8 @@ def fit_of(folder: Path) -> str | None:
         raise DataError(
             f"{folder / RUN}: missing, since the writing of a fit was interrupted; {_AGAIN}"
         )
+    if known and (folder / CONFIG).exists():
+        config_text(folder)  # refused if it was changed
     return None if first is None else str(known[first])
 
 
@@ -114,15 +116,16 @@ def config_text(folder: Path) -> str:
     return text
 
 
-def refuse_foreign_config(folder: Path, text: str) -> None:
-    """Raise `DataError` if a folder has a config that a fit would overwrite and that is no copy.
+def refuse_foreign_config(folder: Path, text: str, path: Path | None = None) -> None:
+    """Raise `DataError` if there is a config that would be overwritten and that no fit has used.
 
     Args:
         folder: the result folder.
-        text: text of the config to be copied to it.
+        text: text of the config to be written.
+        path: the file to write, by default the copy of the config in the folder.
     """
-    path = folder / CONFIG
-    if not path.is_file() or (found := text_of(path)) == text:
+    path = path or folder / CONFIG
+    if not path.is_file() or _is_text(found := text_of(path), _hash(text)):
         return
     try:
         copied = _is_text(found, _hash_of_config(folder))
@@ -138,11 +141,15 @@ def refuse_foreign_config(folder: Path, text: str) -> None:
 def _is_text(text: str, mark: str) -> bool:
     """Return whether a text has this SHA-256, with the line ends of any system.
 
-    Version control and editors change them without being asked.
+    Version control and editors change them, and the one at the end, without being asked.
     """
     plain = text.replace("\r\n", "\n")
-    forms = (text, plain, plain.replace("\n", "\r\n"))
-    return mark in {sha256(form.encode()).hexdigest() for form in forms}
+    forms = (plain, plain.removesuffix("\n"), plain + "\n")
+    return mark in {_hash(f) for one in forms for f in (text, one, one.replace("\n", "\r\n"))}
+
+
+def _hash(text: str) -> str:
+    return sha256(text.encode()).hexdigest()
 
 
 def _hash_of_config(folder: Path) -> str:

@@ -178,8 +178,9 @@ def kinematic_fit(
         whole_poses = np.array([incomplete_poses(data, run) is None for run in runs.tolist()])
         for run in runs[~whole_poses].tolist():
             fitted = own.fitted[data.surface[run]]
-            errors["nominal"][run] = aligned_path(data, run, plain.model, seen).error
-            errors["calibrated"][run] = aligned_path(data, run, fitted, seen).error
+            for name, twists in (("nominal", plain.model), ("calibrated", fitted)):
+                if (path := aligned_path(data, run, twists, seen)) is not None:
+                    errors[name][run] = path.error
         runs = runs[whole_poses]
         for w in replay.replay_windows(data.subset(runs), seen) if len(runs) else ():
             cases = {"nominal": (plain, w), "calibrated": (own, w)}
@@ -213,8 +214,10 @@ class AlignedPath:
     error: float
 
 
-def aligned_path(data: Runs, run: int, model: TwistModel, seen: Robot) -> AlignedPath:
-    """Return the predicted path of a run whose poses lack coordinates.
+def aligned_path(data: Runs, run: int, model: TwistModel, seen: Robot) -> AlignedPath | None:
+    """Return the predicted path of a run whose poses lack coordinates; None with fewer than two.
+
+    Poses count that were measured while the wheels were logged, with the lag of the pose sensor.
 
     The start of such a run is not known. The whole predicted path of the pose sensor is therefore
     aligned with the measured positions, by a rotation and a translation (Procrustes), and the error
@@ -232,6 +235,8 @@ def aligned_path(data: Runs, run: int, model: TwistModel, seen: Robot) -> Aligne
     time, pose = data.time[rows], data.pose[rows]
     shown = data.fresh[rows] & np.isfinite(pose).any(axis=1)
     shown &= (time - lag >= time[0] - 1e-9) & (time - lag <= time[-1] + 1e-9)
+    if shown.sum() < 2:
+        return None
     pose, at = pose[shown], time[shown] - lag
     parts = np.maximum(PARTS_OF_GAP, np.ceil(np.diff(at) / LONGEST_PART_S)).astype(int)
     index = np.concatenate([[0], np.cumsum(parts)])

@@ -17,15 +17,24 @@ MOST_NAME_BYTES = 200
 """Largest number of bytes of a file's name that its temporary name repeats."""
 MARKS = {
     ".json": b'"slipid.',
+    ".geojson": b'"slipid.',
     ".html": b'<meta name="generator" content="slipid">',
     ".png": b"Software\0slipid",
     ".nc": b"slipid.",
     ".mcap": b"\0\0\0slipid ",
 }
 """Bytes by which a file of slipid is recognised, keyed by the ending of its usual name."""
+_MARKS_OF_NAMES = {
+    "design_commands.csv": b"run,floor,load,",
+    "motor_feedforward.h": b"slipid",
+    "motor_feedforward.yaml": b"slipid",
+}
+"""Bytes by which files of other kinds are recognised, keyed by their name."""
 _PICTURE_OF_MATPLOTLIB = b"Software\0Matplotlib version"
 MARKED = 4096
 """Number of bytes at the beginning and at the end of a file that are searched for its mark."""
+MOST_SORTED = 64 * 2**20
+"""Number of bytes of JSON that are searched for its mark, as other programs may sort its keys."""
 
 
 def temporary_of(path: Path) -> Path:
@@ -46,18 +55,22 @@ def name_of_temporary(name: str) -> str | None:
 def refuse_foreign(path: Path, mark: bytes | None = None) -> None:
     """Raise `DataError` if a file exists that slipid did not write, and would thus be lost.
 
+    A file whose ends are empty or only zeros, as after a power cut, can be replaced.
+
     Args:
-        path: the file to write, which may be absent or empty.
-        mark: bytes at the beginning or the end of the files of slipid; those for the ending of the
-            path by default. Files with an ending that has no mark are not checked.
+        path: the file to write, which may be absent.
+        mark: bytes at the beginning or the end of the files of slipid; those for the path by
+            default. Files for which there is no mark are not checked.
     """
-    mark = MARKS.get(path.suffix) if mark is None else mark
+    if mark is None:
+        mark = _MARKS_OF_NAMES.get(path.name, MARKS.get(path.suffix))
     if mark is None or not path.is_file():
         return
     with suppress(OSError), path.open("rb") as file:  # not readable: an error when it is written
-        found = file.read(MARKED)
+        found = file.read(MOST_SORTED if path.suffix == ".json" else MARKED)
         file.seek(max(0, path.stat().st_size - MARKED))
-        if found and mark not in found and mark not in file.read() and not _is_older(path, found):
+        found += file.read()
+        if found.strip(b"\0") and mark not in found and not _is_older(path, found):
             raise DataError(
                 f"{path}: exists and was not written by slipid, and would be overwritten; expected "
                 "a new name or folder (or move the file away)"
@@ -82,7 +95,7 @@ def locked(folder: Path | None, command: str, *names: str) -> Iterator[None]:
     Args:
         folder: the folder; None for a command that writes to none.
         command: name of the command, for the message to others.
-        names: names of files that the command will write, among others.
+        names: names of files that the command will write, among others, with * as a wildcard.
 
     Raises:
         DataError: a different process has the lock, which the message names, the folder cannot be
@@ -91,8 +104,8 @@ def locked(folder: Path | None, command: str, *names: str) -> Iterator[None]:
     if folder is None:
         yield
         return
-    for name in names:
-        refuse_foreign(folder / name)
+    for path in (path for name in names for path in folder.glob(name)):
+        refuse_foreign(path)
     if not HAS_LOCKS:
         _remove_leftovers(folder)
         yield

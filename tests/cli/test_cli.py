@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import inspect
 import itertools
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -19,13 +22,16 @@ import numpy as np
 import pytest
 import typer
 
+import slipid
 from slipid.app.config import read_config, single_floor_sections
 from slipid.app.logs import matching_files, packaged_config, packaged_path
-from slipid.cli.main import app
+from slipid.cli.common import SCHEMAS
+from slipid.cli.main import PANELS, Stream, app
 from slipid.infer.result_folder import refuse_foreign_config
 from slipid.report.html.results import read_results
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes, write_json
+from slipid.support.progress import Reporter
 from tests.helpers.broken_logs import CASES, GENERIC, ROBOTINO, Case, write_good
 from tests.helpers.kept import kept
 from tests.helpers.shared import FEW, invoke
@@ -89,6 +95,19 @@ def test_a_full_disk_for_standard_output_is_2_and_a_sentence(words, buffer):
     ended = subprocess.run(command, env=kept, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (1, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
+def test_work_goes_on_where_progress_cannot_be_written(monkeypatch):
+    with open("/dev/full", "w") as full:
+        stream = Stream(full)
+        monkeypatch.setattr(sys, "stderr", stream)
+        with Reporter() as report:
+            for stage in ("reading", "fitting"):
+                report.stage(stage)
+        stream.flush()
+    assert stream.lost is not None
+    assert stream.lost.errno == errno.ENOSPC
 
 
 @pytest.mark.parametrize("command", ["identify", "check"])
@@ -310,8 +329,11 @@ def test_commands_suggest_what_to_type_next(small, sampled):
     ("words", "message"),
     [
         (("report", "x" * 300), "xx': a name of over 255 bytes; expected a shorter one"),
+        (("sample", "~/a"), "~/a': the shell did not replace the ~; expected a whole path"),
         (("sample", "a\x1b"), r"'a\x1b': a name to write to; expected printable characters"),
         (("sample", "a", "--json", "*"), "--json '*': no name of a file; expected a path without"),
+        (("sample", "a", "--json=-x"), "--json '-x': no name of a file; expected a path without"),
+        (("sample", "a", "--json", "~/a.json"), "--json '~/a.json': no name of a file"),
         (("check", "a", "--data", ".", "--json", "/dev/full"), "--json /dev/full: cannot be wri"),
     ],
 )
@@ -324,14 +346,18 @@ def test_names_to_write_to_are_checked_before_the_work(tmp_path, monkeypatch, wo
 
 
 @pytest.mark.parametrize(
-    "content", ["[robot]", "time,x\n1,2\n", '{"schema": "slipid.fit/9"}', "[]"]
+    "content",
+    [
+        *("[robot]", "time,x\n1,2\n", "[]", '{"schema": "slipid.fit/9"}'),
+        '{"schema": "slipid.identified/1"}',
+    ],
 )
 def test_json_overwrites_no_file_that_is_not_the_json_of_a_result(tmp_path, content):
     path = tmp_path / "mine"
     path.write_text(content)
     result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", path)
     assert result.exit_code == 2
-    assert "mine: a file that `--json` did not write, and would be" in result.stderr
+    assert "mine: a file that `--json` of this command did not write" in result.stderr
     assert path.read_text() == content
     result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", tmp_path / "a.toml")
     assert "a.toml': also the file of config" in result.stderr
@@ -339,6 +365,21 @@ def test_json_overwrites_no_file_that_is_not_the_json_of_a_result(tmp_path, cont
     result = invoke("check", tmp_path / "a.toml", "--data", tmp_path, "--json", path)
     assert "a.toml" in result.stderr
     assert "--json" not in result.stderr
+    words = ("motor", "x.csv", "--json", tmp_path / "old" / "identified.json")
+    words[-1].parent.mkdir()
+    words[-1].write_text('{"schema": "slipid.identified/1"}')
+    assert "identified.json: belongs to the results in" in invoke(*words).stderr
+    assert "x.csv" in invoke(*words, "--out", tmp_path / "old").stderr
+
+
+def test_schemas_of_the_json_of_commands_exist():
+    names = set()
+    for path in Path(slipid.__file__).parent.rglob("*.py"):
+        names |= set(re.findall(r'"slipid\.(\w+)/\d+"', path.read_text(encoding="utf-8")))
+    commands = [one.run for panel in PANELS.values() for one in panel]
+    written = {f.__name__ for f in commands if "json" in inspect.signature(f).parameters}
+    assert {*SCHEMAS} < written
+    assert {schema for name in written for schema in SCHEMAS.get(name, (name,))} <= names
 
 
 @pytest.mark.slow
@@ -382,8 +423,11 @@ def test_a_changed_config_is_not_that_of_the_fit(small, tmp_path):
     assert result.exit_code == 2
     assert "posterior.nc: exists and was not written by slipid" in result.stderr
     (out / "posterior.nc").unlink()
+    config.write_text(text.removesuffix("\n"))
+    assert invoke("report", out).exit_code == 0
     config.write_text(text + "# mine\n")
-    for words in (("report",), ("sample",), ("validate", "--data", folder / "unseen")):
+    unseen, to_go = ("--data", folder / "unseen"), ("--out", tmp_path / "to_go")
+    for words in (("report",), ("sample",), ("design",), ("export", *to_go), ("validate", *unseen)):
         result = invoke(*words, out)
         assert result.exit_code == 2
         assert "config.toml: not the config of the fit" in result.stderr

@@ -1,6 +1,7 @@
 """The demo: recorded logs of the test site, and a fit to a physics that slipid does not know."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -43,14 +44,42 @@ def test_an_edited_config_is_kept(tmp_path):
     config.write_text("mine")
     result = invoke("demo", "--out", tmp_path)
     assert result.exit_code == 2
-    assert "robotino.toml: differs from the config of the demo" in result.stderr
+    assert "robotino.toml: no copy that slipid made for a fit, or changed" in result.stderr
     assert (config.read_text(), len(list(tmp_path.iterdir()))) == ("mine", 1)
     config.unlink()
     (tmp_path / "recorded").mkdir()
     (tmp_path / "recorded" / "mine.csv").touch()
     result = invoke("demo", "--out", tmp_path)
     assert result.exit_code == 2
-    assert "recorded: not of the demo" in result.stderr
+    assert "mine.csv: no recorded log of this version of slipid, or changed" in result.stderr
+    shutil.rmtree(tmp_path / "recorded")
+    (tmp_path / "recorded").touch()
+    assert "recorded: a file; expected a folder" in invoke("demo", "--out", tmp_path).stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["recorded"]
+    (tmp_path / "result").mkdir()
+    for name in ("report.html", "config.toml"):
+        (tmp_path / "result" / name).write_text("mine")
+        result = invoke("demo", "--out", tmp_path)
+        assert result.exit_code == 2
+        assert f"{name}: " in result.stderr
+        assert "would be overwritten" in result.stderr
+        (tmp_path / "result" / name).unlink()
+
+
+def test_recorded_logs_are_unpacked_again_unless_they_were_edited(tmp_path):
+    unpack(tmp_path)
+    log = tmp_path / "fit" / "logs" / "as_built" / "firm" / "run000.csv"
+    recorded = log.read_bytes()
+    (tmp_path / "fit" / "truth" / "truth.json").unlink()  # as after an interrupt
+    (tmp_path / ".DS_Store").write_text("of the system")
+    for unchanged in (recorded.replace(b"\n", b"\r\n"), b"", bytes(1000)):
+        log.write_bytes(unchanged)
+        unpack(tmp_path)
+        assert log.read_bytes() == recorded
+    log.write_bytes(recorded + b"mine")
+    with pytest.raises(DataError, match=r"run000\.csv: no recorded log of this version"):
+        unpack(tmp_path)
+    assert log.read_bytes().endswith(b"mine")
 
 
 def test_packing_what_was_unpacked_gives_the_same_bytes(tmp_path):

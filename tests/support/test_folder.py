@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -10,9 +11,19 @@ from pathlib import Path
 
 import pytest
 
+from slipid.cli import design, motor
+from slipid.infer.design.proposal import COLUMNS
 from slipid.support.errors import DataError
 from slipid.support.files import write_bytes
-from slipid.support.folder import LOCK, MARKS, locked, name_of_temporary, temporary_of
+from slipid.support.folder import (
+    LOCK,
+    MARKED,
+    MARKS,
+    locked,
+    name_of_temporary,
+    refuse_foreign,
+    temporary_of,
+)
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no flock")
 
@@ -134,7 +145,8 @@ def test_where_locks_are_not_supported_work_goes_on(tmp_path, monkeypatch):
 def test_a_file_that_slipid_did_not_write_is_kept(tmp_path, suffix):
     path = tmp_path / f"mine{suffix}"
     new = b"{" + MARKS[suffix] + b"new"
-    for content in (b"", new, MARKS[suffix] + b"damaged"):  # may be replaced
+    zeros = bytes(2 * MARKED)  # as after a power cut
+    for content in (b"", zeros, new, MARKS[suffix] + b"damaged"):  # may be replaced
         path.write_bytes(content)
         write_bytes(path, new)
         assert path.read_bytes() == new
@@ -148,6 +160,33 @@ def test_a_file_that_slipid_did_not_write_is_kept(tmp_path, suffix):
         pass
     assert path.read_bytes() == b"photo"
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_all_files_of_a_command_are_checked_before_the_work(tmp_path):
+    for name in ("bench_a.png", "motor_feedforward.yaml", "motor_feedforward.h"):
+        (tmp_path / name).write_bytes(b"mine")
+        with pytest.raises(DataError, match=name), locked(tmp_path, "motor", *motor.NAMES):
+            pass
+        (tmp_path / name).unlink()
+    for name in ("bench_a.json", "design_commands.csv"):  # not of this command
+        (tmp_path / name).write_bytes(b"mine")
+    with locked(tmp_path, "motor", *motor.NAMES):
+        pass
+    with pytest.raises(DataError, match="design_commands"), locked(tmp_path, "d", *design.NAMES):
+        pass
+    (tmp_path / "design_commands.csv").write_text(COLUMNS)
+    with locked(tmp_path, "design", *design.NAMES):
+        pass
+
+
+def test_json_with_sorted_keys_is_still_that_of_slipid(tmp_path):
+    (tmp_path / "fit.json").write_text(
+        json.dumps({"a": "x" * MARKED, "schema": "slipid.fit/9", "z": "x" * MARKED})
+    )
+    refuse_foreign(tmp_path / "fit.json")
+    (tmp_path / "fit.json").write_text(json.dumps({"a": "x" * 2 * MARKED}))
+    with pytest.raises(DataError, match="not written by slipid"):
+        refuse_foreign(tmp_path / "fit.json")
 
 
 def test_pictures_of_earlier_versions_are_replaced_beside_a_result(tmp_path):

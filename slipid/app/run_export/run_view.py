@@ -215,8 +215,9 @@ def _paths(
         notes.append(f"{sentence}; predicted paths are aligned with the measured poses")
         for name, model in kinematic.items():
             aligned = aligned_path(run, 0, model.fitted.get(floor, model.model), models.seen)
-            paths[name] = BodyPath(aligned.time, aligned.pose)
-        if selected in kinematic:
+            if aligned is not None:
+                paths[name] = BodyPath(aligned.time, aligned.pose)
+        if selected in paths:
             paths["selected"] = paths[selected]
         return paths, selected, notes
     w = replay.replay_windows(run, sensor)[0]

@@ -205,6 +205,8 @@ def _aligned(data: Runs, models: MotionModels, k: int) -> ev.RunEvidence | None:
     offset = np.broadcast_to(np.asarray(seen.camera.marker_place), (len(kept), 2))
     for name, model in models.kinematic.items():
         found = aligned_path(data, k, model.fitted.get(data.surface[k], model.model), seen)
+        if found is None:
+            return None
         x, y, yaw = (np.interp(time, found.time, column) for column in found.pose.T)
         place = np.stack([x, y], axis=-1) + turned(yaw, offset)  # of the pose sensor
         paths[name] = np.column_stack([place, yaw])
