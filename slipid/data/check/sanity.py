@@ -495,8 +495,8 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             f"the poses of {odd.sum()} of {len(odd)} runs do not follow their wheels "
             f"(agreement {np.median(compared.cosine[odd]):.2f}, in the other runs "
             f"{np.median(compared.cosine[moves & ~odd]):.2f})",
-            "check whether these files contain poses of another run or of another time; if so, "
-            "exclude them from the globs of [[logs]]",
+            "check whether these files contain poses of another run or of another time, or have x "
+            "and y or two wheels exchanged; if so, exclude them from the globs of [[logs]]",
             runs=_names(data, odd),
         )
 

@@ -1,4 +1,6 @@
-"""Search for encoders and positions that stay constant in whole runs although the robot moves.
+"""Search for encoders and positions that stay constant although the robot moves.
+
+Encoders are also searched for a constant beginning or end of a run, positions for whole runs.
 
 A wheel may rightly stand still while others turn: a robot turns about it, or an omni robot drives
 along its axle. Its encoder is stuck only if the poses move the rim r of the wheel,
@@ -13,6 +15,8 @@ and poses as they are, and one that is commanded to stand still is not judged.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -28,6 +32,7 @@ from slipid.data.check.findings import (
 from slipid.data.check.joined import (
     ChannelIncrements,
     PoseConvention,
+    StepEdges,
     aligned,
     body_motion,
     edges,
@@ -55,50 +60,126 @@ LEVER_BASES = {True: 1.0, False: 2.0}
 """Largest change of the lever of a wheel, in base radii: one for a pose sensor at the edge of the
 robot, and one for robots whose wheels do not determine the twist, because of their effective track,
 which is up to twice the track [1]."""
+TURNING_SHARE = 0.5
+"""A wheel that turns by more than this share of the travel of the wheel that turns most, although
+the robot does not move its rim, may be exchanged with one that stands still [1]."""
+SETTLING_S = 1.0
+"""Time between the last change of an encoder and the part of the run that is judged, since poses
+may be late [s]."""
 TRANSLATION_SHARE = 0.5
 """Least translation computed from the wheels over their rotation, as an arc at the base radius, for
 a judgement of constant positions; in a turn on the spot unequal wheels cause less [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Motion of wheels and body in the steps of all runs.
+
+    Attributes:
+        at: the steps.
+        moved: increments of the channels over the steps.
+        rim: travel of the rim of each wheel, 0 where it is not known [m].
+        bodies: motion of the body by the poses, and the same without a rotation of their sensor.
+        geometry: geometry of the robot.
+    """
+
+    at: StepEdges
+    moved: ChannelIncrements
+    rim: Float[np.ndarray, "step wheel"]
+    bodies: Float[np.ndarray, "2 step 3"]
+    geometry: Geometry
+
+    @classmethod
+    def of(cls, runs: Runs, geometry: Geometry) -> Self:
+        """Return the motion in runs."""
+        data = joined(runs)
+        at = edges(data)
+        moved = increments(data, at, 0.0)
+        rim = float(geometry.wheel_radius) * np.nan_to_num(moved.wheels)
+        body = body_motion(at, PoseConvention())
+        if moved.twist is not None:  # instead of poses that are not whole
+            body = np.where(np.isfinite(body).all(axis=1)[:, None], body, moved.twist)
+        bodies = np.stack([body, aligned(body, moved.wheels, geometry)])
+        return cls(at, moved, rim, bodies, geometry)
+
+    def span(self, steps: Int[np.ndarray, " step"]) -> Float[np.ndarray, " wheel"]:
+        """Return the range of the travel of each wheel in some steps [m]."""
+        return np.ptp(np.cumsum(self.rim[steps], axis=0), axis=0)
+
+    def expected(
+        self, steps: Int[np.ndarray, " step"], net: bool = False
+    ) -> Float[np.ndarray, " wheel"]:
+        """Return by how far the body moves the rim of each wheel in some steps, see `_expected`.
+
+        If `net`, as for parts of a run, a command to a wheel of a robot whose wheels do not
+        determine the twist is not enough: grass stopped such a wheel, and the others turned on.
+        """
+        least = _least_share(self.moved, steps, self.geometry)
+        if net and not self.geometry.determines_twist:
+            least = np.maximum(least, EXPECTED_SHARE[False])
+        return _expected(self.bodies[:, steps], self.rim[steps], least, self.geometry, net)
+
+    def stopped(self, steps: Int[np.ndarray, " step"]) -> Float[np.ndarray, " wheel"]:
+        """Return by how far the body moves the rims of wheels at the constant ends of their angles.
+
+        Args:
+            steps: steps of one run.
+
+        Returns:
+            The longer path of both ends of the run for each wheel; 0 where it may stand still [m].
+        """
+        out = np.zeros(self.rim.shape[1])
+        for wheel in range(len(out)):
+            changes = steps[np.abs(self.rim[steps, wheel]) > ROUNDING_M]
+            if not len(changes):
+                continue
+            begins, ends = self.at.before[steps], self.at.after[steps]
+            first, last = self.at.before[changes[0]], self.at.after[changes[-1]]
+            for end in (steps[ends <= first - SETTLING_S], steps[begins >= last + SETTLING_S]):
+                span = self.span(end) if len(end) else np.zeros(len(out))
+                still = span < STILL_SHARE * span.max()
+                together = still.sum() > 1 and _stand_together(still, self.geometry)
+                if span.max() > LEAST_PATH_M and not together:
+                    out[wheel] = max(out[wheel], np.nan_to_num(self.expected(end, net=True)[wheel]))
+        return out
 
 
 def stuck_channels(
     runs: Runs, geometry: Geometry
 ) -> tuple[tuple[Finding, ...], Bool[np.ndarray, " run"]]:
     """Return findings about stuck encoders and positions, and the runs that these make useless."""
-    data = joined(runs)
-    at = edges(data)
-    moved = increments(data, at, 0.0)
-    rim = float(geometry.wheel_radius) * np.nan_to_num(moved.wheels)
-    body = body_motion(at, PoseConvention())
-    if moved.twist is not None:  # instead of poses that are not whole
-        body = np.where(np.isfinite(body).all(axis=1)[:, None], body, moved.twist)
-    bodies = np.stack([body, aligned(body, moved.wheels, geometry)])
-    parts = np.split(np.arange(len(rim)), np.flatnonzero(np.diff(at.run)) + 1)
-    span = np.array([np.ptp(np.cumsum(rim[part], axis=0), axis=0) for part in parts])
+    motion = _Motion.of(runs, geometry)
+    parts = np.split(np.arange(len(motion.rim)), np.flatnonzero(np.diff(motion.at.run)) + 1)
+    span = np.array([motion.span(part) for part in parts])
     most = span.max(axis=1, initial=0.0)
     still = (span < STILL_SHARE * most[:, None]) & (most > LEAST_PATH_M)[:, None]
     always = still[most > LEAST_PATH_M].all(axis=0) & still.any(axis=0)
-    expected = np.full(still.shape, np.nan)
+    expected, turns = np.full(still.shape, np.nan), np.zeros(still.shape, bool)
     for run in np.flatnonzero(still.any(axis=1)).tolist():
-        least = _least_share(moved, parts[run], geometry)
-        path = _expected(bodies[:, parts[run]], rim[parts[run]], least, geometry)
+        path = motion.expected(parts[run])
         if np.isnan(path).all() and not geometry.determines_twist:
             path = np.full(len(path), _beyond_circle(runs, run, geometry))
         if still[run].sum() > 1 and _stand_together(still[run], geometry):
             path = np.where(always, path, 0.0)
         expected[run] = np.where(still[run], path, np.nan)
-    stuck = _frozen(runs, geometry, [rim[part] for part in parts])
+        turns[run] = (path == 0) & (span[run] > TURNING_SHARE * most[run])
+    stuck = _frozen(runs, geometry, [motion.rim[part] for part in parts])
     found = [_positions_constant(runs, stuck)] if stuck.any() else []
+    stopped = np.array([motion.stopped(part) for part in parts])
     for wheel in range(still.shape[1]):
         which, path = still[:, wheel], expected[:, wheel]
         every = bool(always[wheel])
-        if not (path > 0).any():
-            if every and np.isnan(path).all():
-                found.append(_never_turns(runs, wheel, float(most.max()), geometry))
-                stuck |= found[-1].severity == "wrong"
-            continue
-        which = which & (every | (path > 0))
-        found.append(_wheel_constant(runs, wheel, which, float(np.nanmax(path))))
-        stuck |= which | every
+        if (path > 0).any():
+            which = which & (every | (path > 0))
+            others = np.flatnonzero(turns[which].any(axis=0)).tolist()
+            found.append(_wheel_constant(runs, wheel, which, float(np.nanmax(path)), others))
+            stuck |= which | every
+        elif every and np.isnan(path).all():
+            found.append(_never_turns(runs, wheel, float(most.max()), geometry))
+            stuck |= found[-1].severity == "wrong"
+        if (which := (stopped[:, wheel] > 0) & ~still[:, wheel]).any():
+            found.append(_wheel_stops(runs, wheel, which, float(stopped[:, wheel].max())))
+            stuck |= which
     return tuple(found), stuck
 
 
@@ -116,13 +197,15 @@ def _expected(
     rim: Float[np.ndarray, "step wheel"],
     least: Float[np.ndarray, " wheel"],
     geometry: Geometry,
+    net: bool = False,
 ) -> Float[np.ndarray, " wheel"]:
     """Return by how far the body moves the rim of each wheel in a run [m].
 
     The path is a sum over parts in which the wheel that turns most travels `LEAST_PATH_M`, since
     the noise of poses would add up over steps. It is 0 below the `least` share of that travel, and
     nan if the motion of the body is not known. The motion is that of the poses for wheels that are
-    commanded to turn, and for others that without a rotation of the pose sensor.
+    commanded to turn, and for others that without a rotation of the pose sensor. If `net`, parts in
+    opposite directions cancel each other, as the noise of poses does.
     """
     known = np.isfinite(bodies[0]).all(axis=1)
     bodies, rim = bodies[:, known], rim[known]
@@ -144,7 +227,8 @@ def _expected(
         along = ahead * x + left * y
         if not confirmed:
             lever = np.clip(-(along @ turn) / squares, lever - slack, lever + slack)
-        out[wheel] = np.abs(along + lever * turn).sum()
+        path = along + lever * turn
+        out[wheel] = abs(path.sum()) if net else np.abs(path).sum()
     return np.where(out > least * travel.max(), out, 0.0)
 
 
@@ -225,20 +309,47 @@ def _positions_constant(runs: Runs, which: Bool[np.ndarray, " run"]) -> Finding:
 
 
 def _wheel_constant(
-    runs: Runs, wheel: int, which: Bool[np.ndarray, " run"], path: float
+    runs: Runs,
+    wheel: int,
+    which: Bool[np.ndarray, " run"],
+    path: float,
+    others: Sequence[int],
 ) -> Finding:
     """Return the finding about the runs in which an encoder is stuck.
 
-    `path` is the longest path by which the body moves the rim of its wheel in one of them [m].
+    Args:
+        runs: all runs.
+        wheel: index of the wheel.
+        which: whether each run is among those.
+        path: longest path by which the body moves the rim of the wheel in one of them [m].
+        others: wheels that turn in some of them, although the body does not move their rims.
     """
+    exchanged = " or ".join(str(other + 1) for other in others)
     return Finding(
         "wheel_constant",
         f"{_wheel(runs, wheel)} never turns in {which.sum()} of {len(which)} runs, while other "
         f"wheels turn and the robot moves its rim by up to {path:.2g} m",
         "check its encoder and cable, whether the wheel was blocked, and the places and the order "
         "of the wheels in the config"
+        + (f"; its column may be exchanged with that of wheel {exchanged}" if others else "")
         + ("" if which.all() else "; exclude these runs from the globs of [[logs]]"),
         runs=() if which.all() else _names(runs, which),
+    )
+
+
+def _wheel_stops(runs: Runs, wheel: int, which: Bool[np.ndarray, " run"], path: float) -> Finding:
+    """Return the finding about the runs in a part of which an encoder is stuck.
+
+    `path` is the longest path by which the body moves the rim of its wheel in such a part [m].
+    """
+    return Finding(
+        "wheel_constant",
+        f"{_wheel(runs, wheel)} does not count at the beginning or the end of {which.sum()} of "
+        f"{len(which)} runs, while other wheels turn and the robot moves its rim by up to "
+        f"{path:.2g} m",
+        "check its encoder and cable, and whether the wheel was blocked; exclude these runs from "
+        "the globs of [[logs]], or cut their files there",
+        runs=_names(runs, which),
     )
 
 

@@ -19,7 +19,7 @@ from slipid.model.geometry import omni
 from slipid.model.robot import Robot
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
-from tests.helpers.plain_robot import MECANUM, OMNI, as_runs, drive
+from tests.helpers.plain_robot import MECANUM, OMNI, SKID, as_runs, drive
 
 SPEED = 0.3
 
@@ -84,6 +84,48 @@ def test_calibrate_refuses_a_dead_encoder():
     raws = [good, replace(bad, angle=bad.angle * [1.0, 0.0, 1.0])]
     with pytest.raises(DataError, match=r"wheel 2 never turns in 1 of 2 runs.*run_01.csv"):
         calibrate(as_runs(raws), Robot.of(OMNI.geometry), quiet=True)
+
+
+@pytest.mark.parametrize("robot", [OMNI, SKID], ids=["omni", "skid"])
+@pytest.mark.parametrize("half", [slice(100, None), slice(None, 101)], ids=["end", "beginning"])
+def test_an_encoder_that_stops_counting_midway_is_found(robot, half):
+    raws = straight(robot, 0.5 * np.pi if robot is OMNI else 0.0, 0.0)
+    assert kinds(raws, robot) == []
+    angle = raws[1].angle.copy()
+    angle[half, 1] = angle[100, 1]
+    found, useless = stuck_channels(
+        as_runs([raws[0], replace(raws[1], angle=angle)]), robot.geometry
+    )
+    assert [finding.kind for finding in found] == ["wheel_constant"]
+    assert "wheel 2 does not count at the beginning or the end of 1 of 2 runs" in str(found[0])
+    assert useless.tolist() == [False, True]
+
+
+def test_a_wheel_that_stands_still_at_the_end_may_be_right():
+    """A robot that first turns and then drives along the axle of a wheel."""
+    first, last = straight(OMNI, 0.5 * np.pi, 0.0)[0], straight(OMNI, 0.0, 0.0)[1]
+    rows = len(first.time)
+    joined = replace(
+        first,
+        time=np.arange(2 * rows) * np.diff(first.time).mean(),
+        **{
+            name: np.concatenate([a := getattr(first, name), (a[-1] if adds else 0) + b])
+            for name, adds in (("angle", 1), ("pose", 1), ("command", 0), ("twist", 0))
+            for b in [getattr(last, name)]
+        },
+    ).less("speed", "current", "voltage", "gyro")
+    assert kinds([joined, joined], OMNI) == []
+
+
+def test_exchanged_wheels_are_named_where_one_stands_still():
+    along = straight(OMNI, 0.0, 0.0, "command", "twist")[0]
+    others = straight(OMNI, 0.5 * np.pi, 0.0, "command", "twist")
+    exchanged = replace(along, angle=along.angle[:, [1, 0, 2]])
+    found, _ = stuck_channels(as_runs([exchanged, *others]), OMNI.geometry)
+    assert "its column may be exchanged with that of wheel" in str(found[0])
+    dead = replace(others[0], angle=others[0].angle * [1.0, 0.0, 1.0])
+    found, _ = stuck_channels(as_runs([dead, along, others[1]]), OMNI.geometry)
+    assert "exchanged" not in str(found[0])
 
 
 @pytest.mark.slow
