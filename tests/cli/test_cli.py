@@ -410,6 +410,21 @@ def test_files_of_the_user_and_logs_are_kept(small, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_log_that_is_cut_off_at_its_beginning_spoils_no_other(small, tmp_path):
+    folder, _ = small
+    logs = tmp_path / "logs"
+    shutil.copytree(folder / "logs", logs)
+    first, *_ = sorted(logs.rglob("*.csv"))
+    name, lines = first.relative_to(logs).as_posix(), first.read_text().splitlines(keepends=True)
+    for rows in (3, 6):
+        first.write_text("".join(lines[:rows]))
+        result = invoke("check", folder / "my.toml", "--data", logs)
+        assert result.exit_code == 0, result.stderr
+        assert f"note: set aside: {name}: no wheel rim moves by 10 mm" in result.stdout
+        assert "no estimate of a fit can be predicted" not in result.stdout
+
+
+@pytest.mark.slow
 def test_a_changed_config_is_not_that_of_the_fit(small, tmp_path):
     folder, _ = small
     out = tmp_path / "out"

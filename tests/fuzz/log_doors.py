@@ -15,12 +15,19 @@ import numpy as np
 
 from slipid.app.bench import read_motor_log
 from slipid.app.logs import unpack
+from slipid.data.check.sanity import findings
+from slipid.data.check.short_runs import short_runs
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.end_poses import read_end_poses
 from slipid.data.reading.layout import CHANNELS
 from slipid.data.reading.motor_layout import MotorOptions, given_columns
 from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import read_logs
+from slipid.data.runs import collect
+from slipid.model.geometry import omni
+from slipid.model.robot import Robot
+from slipid.predict.kinematics import nominal
+from slipid.predict.selection import aligned_path
 from tests.fuzz.door import Door
 from tests.helpers import broken_logs, made_bags, motor_layouts
 from tests.helpers.made_bags import Message, in_order, joint_states, transform, write_bag
@@ -28,6 +35,8 @@ from tests.helpers.made_ulogs import write_ulog
 
 HERE = Path()
 ROBOTINO = {"format": "robotino2022"}
+RADIUS, HEADINGS = 0.04, (20.0, 80.0, 200.0, 270.0)
+SHAPE = omni([60.0, 180.0, 300.0], 0.125, RADIUS, 16.0)
 TWO_FILES = {
     **broken_logs.GENERIC_LAYOUT,
     "columns": {
@@ -83,6 +92,27 @@ def _bag(layout: dict[str, Any], path: Path) -> Any:
     declared = declared_bag_layout(layout, "layout", HERE)
     bags = [p for p in HERE.iterdir() if p.name.startswith("bag")]
     return read_logs(bags[0], declared, HERE, "x", "as_built").logs
+
+
+def _many(path: Path) -> Any:
+    """Read and check several runs, of which one is damaged, as `slipid check` does."""
+    layout = declared_layout(ROBOTINO, "layout")
+    logs = [
+        log
+        for k in range(len(HEADINGS))
+        for log in read_logs(HERE / f"run{k}.csv", layout, HERE, "x", "as_built").logs
+    ]
+    runs = collect(logs)
+    short = short_runs(runs, RADIUS, 5)
+    kept = runs.subset([k for k in range(len(runs)) if k not in short])
+    paths = [aligned_path(runs, k, nominal(SHAPE), Robot.of(SHAPE)) for k in range(len(runs))]
+    return logs, findings(kept, SHAPE), paths
+
+
+def _several(folder: Path) -> None:
+    for k, heading in enumerate(HEADINGS):
+        text = broken_logs.robotino_text(60, heading=heading)
+        (folder / f"run{k}.csv").write_text(text, encoding="utf-8")
 
 
 def _robotino(folder: Path) -> None:
@@ -253,6 +283,7 @@ def _columns_file(folder: Path) -> None:
 DOORS = (
     Door("csv_robotino", _robotino, partial(_rows, ROBOTINO)),
     Door("csv_generic", _generic, partial(_rows, broken_logs.GENERIC_LAYOUT)),
+    Door("csv_many", _several, _many, ("run1.csv",), weight=0.5),
     Door("csv_with_poses", _with_poses, partial(_rows, TWO_FILES)),
     Door("parquet", _parquet, partial(_rows, broken_logs.GENERIC_LAYOUT, name="run.parquet")),
     _bag_door("bag_ros1", partial(_bag_of, "rosbag1", None)),

@@ -158,6 +158,15 @@ def test_paths_of_runs_without_all_coordinates_are_moved_to_the_measured_ones(la
     np.testing.assert_allclose(found.pose[:, 2], expected[:, 2], atol=5e-3)
 
 
+@pytest.mark.parametrize("rows", [1, 20, 21])
+def test_a_run_that_ends_before_its_second_pose_has_no_path(rows):
+    (log,) = run().logs
+    names = ("time", "wheel_angle", "pose", "pose_fresh")
+    cut = replace(log, **{name: getattr(log, name)[:rows] for name in names})
+    found = aligned_path(collect([cut]), 0, nominal(SHAPE), ROBOT)
+    assert (found is None) == (rows < 21)  # every tenth row has a pose, 0.1 s late
+
+
 def test_paths_are_moved_as_rigid_bodies_to_a_start():
     """Compositions of poses, as complex numbers, tell the same."""
     rng = np.random.default_rng(0)
