@@ -319,8 +319,9 @@ def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTa
     found, absent = files_of(task.config, sections, root)
     for section, _ in found:
         floor = _map(task, section)
-        data, short = read_dataset(task.config, [section], root, report)
-        absent += short
+        data, left_out = read_dataset(task.config, [section], root, report)
+        data, short = without_short_runs(task.config, data)
+        absent += [*left_out, *short]
         refuse_misordered(data.logs)
         _go_together(task, data)
         task = replace(task, mixed=(*task.mixed, (data, floor)))
