@@ -170,10 +170,10 @@ def stuck_channels(
         which, path = still[:, wheel], expected[:, wheel]
         every = bool(always[wheel])
         if (path > 0).any():
-            which = which & (every | (path > 0))
+            which = every | (which & (path > 0))
             others = np.flatnonzero(turns[which].any(axis=0)).tolist()
             found.append(_wheel_constant(runs, wheel, which, float(np.nanmax(path)), others))
-            stuck |= which | every
+            stuck |= which
         elif every and np.isnan(path).all():
             found.append(_never_turns(runs, wheel, float(most.max()), geometry))
             stuck |= found[-1].severity == "wrong"
