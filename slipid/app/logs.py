@@ -1,6 +1,7 @@
 """Reading of the logs that a config names, as one set of runs; also access to packaged files."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -342,11 +343,9 @@ def _refuse_other_logs(folder: Path, content: Mapping[str, bytes]) -> None:
         and name_of_temporary(path.name) is None
         and path.relative_to(folder).as_posix() not in content
     ]
-    theirs += [
-        path
-        for path, data in ((folder / name, data) for name, data in content.items())
-        if path.is_file() and _plain(path.read_bytes()) not in (b"", _plain(data))
-    ]
+    for path, data in ((folder / name, data) for name, data in content.items()):
+        with suppress(OSError):  # not readable: an error when it is written
+            theirs += [path] * (_plain(path.read_bytes()) not in (b"", _plain(data)))
     if theirs:
         raise DataError(
             f"{theirs[0]}: no recorded log of this version of slipid, or changed since; expected a "

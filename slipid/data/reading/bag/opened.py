@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -34,6 +35,8 @@ MOST_METADATA = 2**20
 """Largest size of metadata.yaml, which is read slowly [byte]."""
 MOST_REFERENCES = 20
 """Largest number of references in metadata.yaml, which has none if ROS wrote it."""
+MOST_NESTED = 50
+"""Largest depth of brackets in metadata.yaml, in which ROS writes no more than a few."""
 _METADATA = "copy the folder again, or run: ros2 bag reindex {file}"
 
 
@@ -251,11 +254,15 @@ def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Re
 def _check_metadata(path: Path) -> None:
     """Raise `ValueError` for a metadata.yaml that ROS cannot have written.
 
-    The text of a value with references may be exponential in their number.
+    The text of a value with references may be exponential in their number, and the time to read
+    brackets in brackets is quadratic in their depth.
     """
     raw = read_bytes(path, "the metadata of a bag", MOST_METADATA)
     if len(re.findall(rb"(?:^|[\s,:\[{-])\*\w", raw)) > MOST_REFERENCES:
         raise ValueError("metadata with many references")
+    brackets = re.findall(rb"[\[\]{}]", raw)
+    if max(accumulate(1 if one in b"[{" else -1 for one in brackets), default=0) > MOST_NESTED:
+        raise ValueError(f"metadata with over {MOST_NESTED} brackets in brackets")
 
 
 def damage_error(files: BagFiles, error: Exception) -> DataError:
