@@ -305,7 +305,7 @@ def main() -> None:
     sys.unraisablehook = _interrupt_again
     # where its folders cannot be written, matplotlib works all the same
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    out, errors = Stream(sys.stdout), Stream(sys.stderr)
+    out, errors = LossyStream(sys.stdout), LossyStream(sys.stderr)
     sys.stdout, sys.stderr = cast("tuple[TextIO, TextIO]", (out, errors))
     try:
         app()
@@ -318,7 +318,7 @@ def main() -> None:
             sys.exit(1 if out.lost.errno == errno.EPIPE else 2)
 
 
-class Stream:
+class LossyStream:
     """A standard stream whose errors do not stop the work, since its files matter more.
 
     After an error nothing is written to it any more.

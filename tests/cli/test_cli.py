@@ -26,7 +26,7 @@ import slipid
 from slipid.app.config import read_config, single_floor_sections
 from slipid.app.logs import matching_files, packaged_config, packaged_path
 from slipid.cli.common import SCHEMAS
-from slipid.cli.main import PANELS, Stream, app
+from slipid.cli.main import PANELS, LossyStream, app
 from slipid.infer.result_folder import refuse_foreign_config
 from slipid.report.html.results import read_results
 from slipid.support.errors import DataError
@@ -100,7 +100,7 @@ def test_a_full_disk_for_standard_output_is_2_and_a_sentence(words, buffer):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
 def test_work_goes_on_where_progress_cannot_be_written(monkeypatch):
     with open("/dev/full", "w") as full:
-        stream = Stream(full)
+        stream = LossyStream(full)
         monkeypatch.setattr(sys, "stderr", stream)
         with Reporter() as report:
             for stage in ("reading", "fitting"):
